@@ -1,0 +1,305 @@
+//! The mixture module: agent and background as K slots, each a mask and an image (mixture spec 2 and 3).
+//!
+//! Read [`Mixture::observe`] first: it is the table of mixture spec 3 line by line. [`Mixture::imagine`] is its
+//! second column, [`Mixture::skip`] an imagined step that also feeds the posterior's memory.
+
+mod comp_decoder;
+mod comp_path;
+mod encoder;
+mod mask_decoder;
+mod mask_path;
+mod residual;
+
+use tch::{Kind, Tensor};
+
+use self::{
+    comp_decoder::CompDecoder,
+    comp_path::{CompPath, Components},
+    encoder::FrameEncoder,
+    mask_decoder::{MaskDecoder, stick_breaking},
+    mask_path::{Drive, MaskPath, Masks},
+};
+use crate::{
+    config::MixtureConfig,
+    nn::{LearnedState, LstmBank, Normal, Path},
+    noise::{Noise, Site},
+};
+
+/// Hidden and cell state of one LSTM family, `[B, K, hidden]` each.
+#[derive(Debug)]
+pub struct Memory {
+    /// Hidden state.
+    pub h: Tensor,
+    /// Cell state.
+    pub c: Tensor,
+}
+
+impl Memory {
+    /// Another handle on the same tensors.
+    #[must_use]
+    pub fn shallow_clone(&self) -> Self {
+        Self { h: self.h.shallow_clone(), c: self.c.shallow_clone() }
+    }
+}
+
+/// The recurrent state of the mixture, before the next frame.
+#[derive(Debug)]
+pub struct MixtureState {
+    /// Mask latents of the last step, `[B, K, z_mask]`.
+    pub z_mask: Tensor,
+    /// Component latents of the last step, `[B, K, z_comp]`.
+    pub z_comp: Tensor,
+    /// Posterior memory of the masks.
+    pub mask_post: Memory,
+    /// Prior memory of the masks.
+    pub mask_prior: Memory,
+    /// Posterior memory of the components.
+    pub comp_post: Memory,
+    /// Prior memory of the components.
+    pub comp_prior: Memory,
+}
+
+/// What one step of the mixture gives.
+#[derive(Debug)]
+pub struct MixtureStep {
+    /// Log masks, `[B, K, 1, H, W]`; masks sum to one over slots.
+    pub log_masks: Tensor,
+    /// Component images in [0, 1], `[B, K, 3, H, W]`.
+    pub components: Tensor,
+    /// `mu_mix = Σ_k π_k o_k`, `[B, 3, H, W]`.
+    pub mu_mix: Tensor,
+    /// Distribution the mask latents were drawn from, before the residual update, `[B, K, z_mask]`.
+    pub mask_raw: Normal,
+    /// Distribution the component latents were drawn from, `[B, K, z_comp]`.
+    pub comp_raw: Normal,
+    /// Residuals `Δ MLP_res` of masks `[B, K, z_mask]` and components `[B, K, z_comp]`; meaningless on a row's
+    /// first frame.
+    pub residuals: (Tensor, Tensor),
+    /// Priors of mask and component latents under the drawn latents; present if asked for while observing.
+    pub priors: Option<(Normal, Normal)>,
+}
+
+/// Which memories a step updates.
+#[derive(Clone, Copy, Eq, PartialEq)]
+enum Families {
+    Both,
+    Prior,
+}
+
+/// The mixture module.
+#[derive(Debug)]
+pub struct Mixture {
+    encoder: FrameEncoder,
+    masks: MaskPath,
+    mask_decoder: MaskDecoder,
+    comps: CompPath,
+    comp_decoder: CompDecoder,
+    mask_post: (LstmBank, LearnedState),
+    mask_prior: (LstmBank, LearnedState),
+    comp_post: (LstmBank, LearnedState),
+    comp_prior: (LstmBank, LearnedState),
+    z_mask_start: Tensor,
+    z_comp_start: Tensor,
+    z_mask: i64,
+    z_comp: i64,
+}
+
+impl Mixture {
+    /// Creates the parameters under `path`; `action` is the width of the enhanced action.
+    pub fn new(path: &Path<'_>, config: &MixtureConfig, action: i64, image_size: i64) -> Self {
+        let (slots, hidden) = (config.slots, config.hidden);
+        let family = |name: &str, z| {
+            let path = path.sub("memory").sub(name);
+            let bank = LstmBank::new(&path, slots, z + config.encoder.features, hidden);
+            (bank, LearnedState::new(&path.sub("start"), &[slots, hidden], config.init))
+        };
+        let start = |name: &str, z| path.weight(name, &[slots, z], LearnedState::init(config.init));
+        let encoder = &path.sub("encoder");
+        Self {
+            encoder: FrameEncoder::new(encoder, &config.encoder, image_size, config.init),
+            masks: MaskPath::new(&path.sub("mask"), config, action),
+            mask_decoder: MaskDecoder::new(&path.sub("mask_decoder"), config, action, image_size),
+            comps: CompPath::new(&path.sub("comp"), config, action, image_size),
+            comp_decoder: CompDecoder::new(&path.sub("comp_decoder"), config, action, image_size),
+            mask_post: family("mask_post", config.z_mask),
+            mask_prior: family("mask_prior", config.z_mask),
+            comp_post: family("comp_post", config.z_comp),
+            comp_prior: family("comp_prior", config.z_comp),
+            z_mask_start: start("z_mask_start", config.z_mask),
+            z_comp_start: start("z_comp_start", config.z_comp),
+            z_mask: config.z_mask,
+            z_comp: config.z_comp,
+        }
+    }
+
+    /// The learned state before any frame.
+    pub fn initial_state(&self, batch: i64) -> MixtureState {
+        let memory = |(_, start): &(LstmBank, LearnedState)| {
+            let (h, c) = start.expand(batch);
+            Memory { h, c }
+        };
+        let latent = |start: &Tensor| start.unsqueeze(0).expand([batch, -1, -1], false);
+        MixtureState {
+            z_mask: latent(&self.z_mask_start),
+            z_comp: latent(&self.z_comp_start),
+            mask_post: memory(&self.mask_post),
+            mask_prior: memory(&self.mask_prior),
+            comp_post: memory(&self.comp_post),
+            comp_prior: memory(&self.comp_prior),
+        }
+    }
+
+    /// Absorbs a frame: latents from the posterior, all four memories updated.
+    ///
+    /// # Shapes
+    /// `frame [B, 3, H, W]` in [0, 1], `action [B, ā]` (the enhanced action that led to the frame),
+    /// `first [B]` bool. With `priors` the prior's distributions under the drawn latents are computed too.
+    #[expect(clippy::too_many_arguments, reason = "inputs of the step, flags of training")]
+    pub fn observe(
+        &self,
+        state: &MixtureState,
+        frame: &Tensor,
+        action: &Tensor,
+        first: &Tensor,
+        noise: &dyn Noise,
+        priors: bool,
+        train: bool,
+    ) -> (MixtureState, MixtureStep) {
+        let first = first.view([-1, 1, 1]);
+        let encoding = self.encoder.forward(frame);
+        let masks = self.masks.posterior(
+            &encoding,
+            &state.mask_post.h,
+            action,
+            &state.z_mask,
+            &first,
+            &noise.normal(Site::Mask, &shape(state, self.z_mask)),
+        );
+        let log_masks = stick_breaking(&self.mask_decoder.forward(&masks.z, action));
+        let comps = self.comps.posterior(
+            frame,
+            &log_masks,
+            &state.comp_post.h,
+            action,
+            &state.z_comp,
+            &first,
+            &noise.normal(Site::Component, &shape(state, self.z_comp)),
+            train,
+        );
+        let priors = priors.then(|| {
+            let (z, h) = (&state.z_mask, &state.mask_prior.h);
+            let mask = self.masks.prior(z, h, action, &Drive::Given(&masks.z)).raw;
+            let (z, h) = (&state.z_comp, &state.comp_prior.h);
+            (mask, self.comps.prior_distribution(&masks.z, z, h, action))
+        });
+        let (next, step) =
+            self.finish(state, masks, log_masks, comps, action, Families::Both, train);
+        (next, MixtureStep { priors, ..step })
+    }
+
+    /// Predicts a frame: latents from the prior, only the prior's memories updated.
+    ///
+    /// # Shapes
+    /// As in [`Mixture::observe`].
+    pub fn imagine(
+        &self,
+        state: &MixtureState,
+        action: &Tensor,
+        first: &Tensor,
+        noise: &dyn Noise,
+    ) -> (MixtureState, MixtureStep) {
+        self.predict(state, action, first, noise, Families::Prior)
+    }
+
+    /// Passes over a frame that never came: latents from the prior, all four memories fed with them.
+    pub fn skip(
+        &self,
+        state: &MixtureState,
+        action: &Tensor,
+        first: &Tensor,
+        noise: &dyn Noise,
+    ) -> (MixtureState, MixtureStep) {
+        self.predict(state, action, first, noise, Families::Both)
+    }
+
+    /// Makes the exact inference forms; gradients must be off from here on.
+    pub fn freeze(&mut self) {
+        self.comps.freeze();
+        self.comp_decoder.freeze();
+    }
+
+    fn predict(
+        &self,
+        state: &MixtureState,
+        action: &Tensor,
+        first: &Tensor,
+        noise: &dyn Noise,
+        families: Families,
+    ) -> (MixtureState, MixtureStep) {
+        let first = &first.view([-1, 1, 1]);
+        let mask_noise = &noise.normal(Site::Mask, &shape(state, self.z_mask));
+        let drive = Drive::Sample { noise: mask_noise, first };
+        let masks = self.masks.prior(&state.z_mask, &state.mask_prior.h, action, &drive);
+        let log_masks = stick_breaking(&self.mask_decoder.forward(&masks.z, action));
+        let comp_noise = noise.normal(Site::Component, &shape(state, self.z_comp));
+        let h_prior = &state.comp_prior.h;
+        let comps = self.comps.prior(&masks.z, &state.z_comp, h_prior, action, first, &comp_noise);
+        self.finish(state, masks, log_masks, comps, action, families, false)
+    }
+
+    /// Lines 11 to 15: decode, mix, encode the mixture, remember.
+    #[expect(clippy::too_many_arguments, reason = "the results of the lines before")]
+    fn finish(
+        &self,
+        state: &MixtureState,
+        masks: Masks,
+        log_masks: Tensor,
+        comps: Components,
+        action: &Tensor,
+        families: Families,
+        train: bool,
+    ) -> (MixtureState, MixtureStep) {
+        let components = self.comp_decoder.forward(&comps.z, action, train);
+        let mu_mix = (log_masks.exp() * &components).sum_dim_intlist(1, false, Kind::Float);
+        let encoding = self.encoder.forward(&mu_mix).unsqueeze(1); // [B, 1, e]
+        let encodings = encoding.expand([-1, masks.z.size()[1], -1], false);
+        let inputs = |z: &Tensor| Tensor::cat(&[z, &encodings], -1);
+        let advance = |(bank, _): &(LstmBank, LearnedState), input: &Tensor, memory: &Memory| {
+            let (h, c) = bank.forward(input, (&memory.h, &memory.c));
+            Memory { h, c }
+        };
+        let (mask_input, comp_input) = (inputs(&masks.z), inputs(&comps.z));
+        let (mask_post, comp_post) = match families {
+            Families::Both => (
+                advance(&self.mask_post, &mask_input, &state.mask_post),
+                advance(&self.comp_post, &comp_input, &state.comp_post),
+            ),
+            Families::Prior => (state.mask_post.shallow_clone(), state.comp_post.shallow_clone()),
+        };
+        let next = MixtureState {
+            mask_post,
+            mask_prior: advance(&self.mask_prior, &mask_input, &state.mask_prior),
+            comp_post,
+            comp_prior: advance(&self.comp_prior, &comp_input, &state.comp_prior),
+            z_mask: masks.z,
+            z_comp: comps.z,
+        };
+        let mask_residual = masks.residual.expect("latents that were drawn have a residual");
+        let step = MixtureStep {
+            log_masks,
+            components,
+            mu_mix,
+            mask_raw: masks.raw,
+            comp_raw: comps.raw,
+            residuals: (mask_residual, comps.residual),
+            priors: None,
+        };
+        (next, step)
+    }
+}
+
+/// `[B, K, width]` of a state's slots.
+fn shape(state: &MixtureState, width: i64) -> [i64; 3] {
+    let size = state.z_mask.size();
+    [size[0], size[1], width]
+}

@@ -1,0 +1,3 @@
+//! Training and evaluation of GATSBI world models.
+
+pub mod untrained;
