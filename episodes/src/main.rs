@@ -1,0 +1,280 @@
+//! `gatsbi-episodes`: imports, inspects and splits data sets from the command line.
+
+use std::{
+    io::{self, IsTerminal as _, Write as _},
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+use anyhow::{Context as _, bail, ensure};
+use clap::{Args, Parser, Subcommand};
+use gatsbi_episodes::{
+    ActionDimension, Dataset, Manifest, NpzImport, WriterOptions, import_npz, write_whole,
+};
+use indicatif::{ProgressBar, ProgressStyle};
+
+mod report;
+
+use report::Report;
+
+/// Robot episodes in Parquet files: import, inspect, split.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Convert data of another format to a new data set.
+    #[command(subcommand)]
+    Import(Import),
+    /// Print the description, counts, sizes and action statistics of a data set.
+    Info(Info),
+    /// Copy some episodes of a data set to a new one; ids are kept.
+    Split(Split),
+}
+
+#[derive(Debug, Subcommand)]
+enum Import {
+    /// A numpy archive with the arrays rgb [E,T,H,W,3] u1, act [E,T,A] f4 and, if known, lab [E,T,H,W] u1 (0 background,
+    /// 1 agent, 2.. objects), obj [E,T,M,3] f4 (metres, NaN = absent) and n [E] (object counts).
+    Npz(Npz),
+}
+
+#[derive(Debug, Args)]
+struct Npz {
+    /// The archive.
+    file: PathBuf,
+    /// Folder to create.
+    #[arg(long)]
+    out: PathBuf,
+    /// Name of the data set.
+    #[arg(long, default_value = "push1")]
+    name: String,
+    /// Seconds between two frames.
+    #[arg(long, default_value_t = 0.2)]
+    frame_period: f64,
+    /// Names of the action dimensions, separated by commas.
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "panda_joint1,panda_joint2,panda_joint3,panda_joint4,panda_joint5,panda_joint6,panda_joint7"
+    )]
+    action_names: Vec<String>,
+    /// Units of the action dimensions, separated by commas; one alone holds for all.
+    #[arg(long, value_delimiter = ',', default_value = "rad/s")]
+    action_units: Vec<String>,
+    /// Program, simulator or robot that made the data, kept as its provenance.
+    #[arg(long, default_value = "unknown")]
+    generator: String,
+    /// Id of the first episode; the others count on from it.
+    #[arg(long, default_value_t = 0)]
+    first_id: u64,
+    #[command(flatten)]
+    writer: Writer,
+}
+
+#[derive(Debug, Args)]
+struct Info {
+    /// Data-set folder or .parquet file.
+    path: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+    /// Also read everything: compare checksums and decode every episode.
+    #[arg(long)]
+    verify: bool,
+}
+
+#[derive(Debug, Args)]
+struct Split {
+    /// Data-set folder or .parquet file.
+    path: PathBuf,
+    /// Folder to create.
+    #[arg(long)]
+    out: PathBuf,
+    /// Copy the last so many episodes.
+    #[arg(long, required_unless_present = "range", conflicts_with = "range")]
+    last: Option<usize>,
+    /// Copy the episodes at these positions: A..B, A.. or ..B, counted from 0, B excluded.
+    #[arg(long)]
+    range: Option<String>,
+    #[command(flatten)]
+    writer: Writer,
+}
+
+#[derive(Debug, Args)]
+struct Writer {
+    /// Size in MiB at which a shard is closed.
+    #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=1024))]
+    shard_mib: u16,
+    /// zstd level.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(i32).range(1..=22))]
+    zstd_level: i32,
+}
+
+fn main() -> anyhow::Result<()> {
+    match Cli::parse().command {
+        Command::Import(Import::Npz(npz)) => import(&npz),
+        Command::Info(info) => inspect(&info),
+        Command::Split(split) => copy(&split),
+    }
+}
+
+fn import(npz: &Npz) -> anyhow::Result<()> {
+    let (names, units) = (&npz.action_names, &npz.action_units);
+    ensure!(
+        units.len() == 1 || units.len() == names.len(),
+        "--action-units gives {} units for the {} names of --action-names; give one for all or one for each",
+        units.len(),
+        names.len()
+    );
+    let dimension = |(name, unit): (&String, &String)| ActionDimension {
+        name: name.clone(),
+        unit: unit.clone(),
+    };
+    let import = NpzImport {
+        name: npz.name.clone(),
+        frame_period_seconds: npz.frame_period,
+        actions: names.iter().zip(units.iter().cycle()).map(dimension).collect(),
+        generator: npz.generator.clone(),
+        first_id: npz.first_id,
+    };
+    let bar = progress_bar();
+    let manifest = import_npz(&npz.file, &npz.out, &import, npz.writer.options(), |done, all| {
+        bar.set_length(all as u64);
+        bar.set_position(done as u64);
+    })?;
+    bar.finish_and_clear();
+    print_written(&npz.out, &manifest)
+}
+
+fn inspect(info: &Info) -> anyhow::Result<()> {
+    let report = Report::of(&Dataset::open(&info.path)?, info.verify)?;
+    if info.json {
+        print(&(serde_json::to_string_pretty(&report)? + "\n"))
+    } else {
+        print(&report.to_string())
+    }
+}
+
+fn copy(split: &Split) -> anyhow::Result<()> {
+    let dataset = Dataset::open(&split.path)?;
+    let range = split.positions(dataset.len())?;
+    let bar = progress_bar();
+    bar.set_length(range.len() as u64);
+    let info = dataset.info().clone();
+    let manifest = write_whole(&split.out, info, split.writer.options(), |writer| {
+        for index in bar.wrap_iter(range) {
+            writer.write(&dataset.read(index)?)?;
+        }
+        Ok(())
+    })?;
+    bar.finish_and_clear();
+    print_written(&split.out, &manifest)
+}
+
+impl Split {
+    fn positions(&self, len: usize) -> anyhow::Result<Range<usize>> {
+        let range = match (self.last, &self.range) {
+            (Some(last), _) => match len.checked_sub(last) {
+                Some(first) => first..len,
+                None => bail!("--last {last}: there are only {len} episodes"),
+            },
+            (None, Some(range)) => {
+                parse_range(range, len).with_context(|| format!("--range {range}"))?
+            }
+            (None, None) => 0..len,
+        };
+        ensure!(!range.is_empty(), "the split would have no episodes");
+        Ok(range)
+    }
+}
+
+fn parse_range(text: &str, len: usize) -> anyhow::Result<Range<usize>> {
+    let (start, end) = text.split_once("..").context("expected A..B, A.. or ..B")?;
+    let bound = |text: &str, default| match text {
+        "" => Ok(default),
+        text => text.parse().with_context(|| format!("`{text}` is not a position")),
+    };
+    let range = bound(start, 0)?..bound(end, len)?;
+    ensure!(range.end <= len, "there are only {len} episodes");
+    Ok(range)
+}
+
+impl Writer {
+    fn options(&self) -> WriterOptions {
+        let shard_bytes = usize::from(self.shard_mib) << 20;
+        WriterOptions { shard_bytes, zstd_level: self.zstd_level }
+    }
+}
+
+/// A bar in a terminal, nothing otherwise.
+fn progress_bar() -> ProgressBar {
+    if !io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} episodes, {eta} left")
+        .unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::no_length().with_style(style)
+}
+
+fn print_written(dir: &Path, manifest: &Manifest) -> anyhow::Result<()> {
+    let bytes: u64 = manifest.shards.iter().map(|shard| shard.bytes).sum();
+    print(&format!(
+        "wrote {}: episodes {}, frames {}, shards {}, {}\n",
+        dir.display(),
+        manifest.episodes,
+        manifest.frames,
+        manifest.shards.len(),
+        indicatif::DecimalBytes(bytes)
+    ))
+}
+
+/// Prints to standard output; a reader that has seen enough, such as `head`, is no failure.
+fn print(text: &str) -> anyhow::Result<()> {
+    match io::stdout().write_all(text.as_bytes()) {
+        Err(e) if e.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.context("standard output"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn ranges_are_half_open_and_checked() {
+        assert_eq!(parse_range("2..5", 10).unwrap(), 2..5);
+        assert_eq!(parse_range("..260", 300).unwrap(), 0..260);
+        assert_eq!(parse_range("260..", 300).unwrap(), 260..300);
+        for wrong in ["5", "a..b", "0..11", "-1..3", "1..2..3"] {
+            assert!(parse_range(wrong, 10).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn an_empty_split_is_refused() {
+        let split = |args: &[&str]| {
+            let args = ["gatsbi-episodes", "split", "in", "--out", "out"].iter().chain(args);
+            match Cli::try_parse_from(args).unwrap().command {
+                Command::Split(split) => split.positions(10),
+                other => panic!("{other:?}"),
+            }
+        };
+        assert_eq!(split(&["--last", "4"]).unwrap(), 6..10);
+        assert_eq!(split(&["--range", "4.."]).unwrap(), 4..10);
+        for wrong in [["--last", "0"], ["--last", "11"], ["--range", "5..5"], ["--range", "6..5"]] {
+            assert!(split(&wrong).is_err(), "{wrong:?}");
+        }
+    }
+}
