@@ -6,6 +6,9 @@ use tch::{Kind, Tensor};
 use super::mixture::MixtureStep;
 use crate::nn::{Normal, distributions::normal_log_density};
 
+/// Keeps logarithms of alpha and its complement finite.
+const EPS: f64 = 1e-5;
+
 /// log N(frame | mean, sigma²) summed over pixels and channels, `[B]`.
 pub fn gaussian_log_likelihood(frame: &Tensor, mean: &Tensor, sigma: f64) -> Tensor {
     sum(&normal_log_density(frame, mean, sigma))
@@ -23,6 +26,27 @@ pub fn mixture_log_likelihood(
 ) -> Tensor {
     let density = normal_log_density(&frame.unsqueeze(1), components, sigma);
     sum(&(log_masks + density).logsumexp(1, false))
+}
+
+/// log [α N(frame | o_fg, sigma²) + (1 - α) Σ_k π_k N(frame | o_k, sigma²)] per pixel and channel, summed, `[B]`:
+/// objects and slots compete for every pixel (mixture spec 5, form c; after SPACE).
+///
+/// # Shapes
+/// `foreground [B, 3, H, W]`, not premultiplied; `alpha [B, 1, H, W]` in [0, 1]; the rest as in
+/// [`mixture_log_likelihood`].
+pub fn joint_log_likelihood(
+    frame: &Tensor,
+    foreground: &Tensor,
+    alpha: &Tensor,
+    log_masks: &Tensor,
+    components: &Tensor,
+    sigma: f64,
+) -> Tensor {
+    let slots = log_masks + normal_log_density(&frame.unsqueeze(1), components, sigma);
+    let rest: Tensor = 1.0 - alpha;
+    let background = slots.logsumexp(1, false) + rest.clamp_min(EPS).log();
+    let objects = normal_log_density(frame, foreground, sigma) + alpha.clamp_min(EPS).log();
+    sum(&background.logaddexp(&objects))
 }
 
 /// The image of the fixed-alpha window: foreground over the mixture weighted by a constant (object spec 6.6).

@@ -7,6 +7,9 @@ use crate::{
     nn::{Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Mlp, Path, SubPixelConv},
 };
 
+/// Mask logit that decoders start from.
+const START_LOGIT: f64 = -2.0;
+
 /// Decodes the first K-1 slots' latents to logits; the last slot takes what they leave.
 #[derive(Debug)]
 pub(crate) struct MaskDecoder {
@@ -91,6 +94,12 @@ impl MaskDecoder {
         let base_norm = GroupNorm::new(&path.sub("base_norm"), decoder.base_groups, decoder.base);
         let (stages, channels) = stages(path, decoder.base, &decoder.stages, scheme);
         let output = Conv2d::new(&path.sub("output"), ConvShape::same(channels, 1, 3), scheme);
+        if let (InitScheme::Orthogonal, Some(bias)) = (scheme, &output.bias) {
+            // Slots start small and leave the image to the last one. Having to shrink first was seen to drive
+            // the whole chain before the decoder into saturation.
+            let _no_grad = tch::no_grad_guard();
+            let _ = bias.shallow_clone().fill_(START_LOGIT);
+        }
         Self {
             condition: Mlp::new(&path.sub("condition"), &widths, scheme),
             base: (base, base_norm),

@@ -42,6 +42,11 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
 }
 
 impl Rendering {
+    /// The objects' colours without their alpha, `[B, 3, H, W]`; meaningless where `alpha` is 0.
+    pub fn colour(&self) -> Tensor {
+        &self.foreground / (&self.alpha + EPS)
+    }
+
     /// `mu_t = mu^o + (1 - alpha) mu_mix`, `[B, 3, H, W]`.
     pub fn over(&self, mu_mix: &Tensor) -> Tensor {
         &self.foreground + (1.0 - &self.alpha) * mu_mix

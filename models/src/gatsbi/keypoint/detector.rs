@@ -1,5 +1,4 @@
-//! The keypoint detector: what moves with the action, as N points and as the map gamma (mixture spec 2.6 and
-//! 4, after Minderer et al. 2019).
+//! The detector: frames to heatmaps, heatmaps to keypoints, keypoints to the map gamma (mixture spec 2.6 and 4).
 
 use tch::{Kind, Tensor};
 
@@ -18,10 +17,54 @@ const GAUSSIAN_STD: f64 = 1.5 / 16.0;
 /// Frames to keypoints.
 #[derive(Debug)]
 pub struct Detector {
-    convs: Vec<Conv2d>,
+    trunk: Trunk,
     output: Conv2d,
     gamma: GammaForm,
     image_size: i64,
+}
+
+/// Convolutions at three scales, each half the one before: the detector's and the appearance network's.
+#[derive(Debug)]
+pub(super) struct Trunk {
+    convs: Vec<Conv2d>,
+}
+
+impl Trunk {
+    pub(super) fn new(path: &Path<'_>, inputs: i64, config: &DetectorConfig) -> Self {
+        let mut shapes = Vec::new();
+        let mut inputs = inputs;
+        for scale in 0..3 {
+            let channels = config.filters << scale;
+            shapes.push(if scale == 0 {
+                ConvShape::same(inputs, channels, 3)
+            } else {
+                ConvShape::halving(inputs, channels, 3)
+            });
+            let extra = (0..config.convs_per_scale).map(|_| ConvShape::same(channels, channels, 3));
+            shapes.extend(extra);
+            inputs = channels;
+        }
+        let path = path.sub("conv");
+        let convs = shapes.iter().enumerate().map(|(i, shape)| he_uniform(&path.sub(i), *shape));
+        Self { convs: convs.collect() }
+    }
+
+    /// `[B, inputs, H, W]` to `[B, 4 filters, H/4, W/4]`.
+    pub(super) fn forward(&self, x: &Tensor) -> Tensor {
+        self.convs.iter().fold(x.shallow_clone(), |x, conv| leaky(&conv.forward(&x)))
+    }
+}
+
+/// A convolution that starts as the keypoint networks' do.
+pub(super) fn he_uniform(path: &Path<'_>, shape: ConvShape) -> Conv2d {
+    let fan_in = (shape.inputs * shape.kernel * shape.kernel) as f64;
+    let init = Init::Uniform { bound: (6.0 / fan_in).sqrt() };
+    Conv2d::with(path, shape, init, Some(Init::Constant(0.0)))
+}
+
+/// The activation of the keypoint networks.
+pub(super) fn leaky(x: &Tensor) -> Tensor {
+    Activation::LeakyRelu.apply(x)
 }
 
 /// Keypoints of a batch of frames.
@@ -36,32 +79,10 @@ pub struct Keypoints {
 impl Detector {
     /// Creates the parameters under `path`.
     pub fn new(path: &Path<'_>, config: &DetectorConfig, image_size: i64) -> Self {
-        let mut shapes = Vec::new();
-        let mut inputs = 5;
-        for scale in 0..3 {
-            let channels = config.filters << scale;
-            shapes.push(if scale == 0 {
-                ConvShape::same(inputs, channels, 3)
-            } else {
-                ConvShape::halving(inputs, channels, 3)
-            });
-            shapes.extend(
-                (0..config.convs_per_scale).map(|_| ConvShape::same(channels, channels, 3)),
-            );
-            inputs = channels;
-        }
-        let conv = |path: Path<'_>, shape: ConvShape| {
-            let fan_in = (shape.inputs * shape.kernel * shape.kernel) as f64;
-            let he_uniform = Init::Uniform { bound: (6.0 / fan_in).sqrt() };
-            Conv2d::with(&path, shape, he_uniform, Some(Init::Constant(0.0)))
-        };
+        let output = ConvShape::same(4 * config.filters, config.keypoints, 1);
         Self {
-            convs: shapes
-                .into_iter()
-                .enumerate()
-                .map(|(i, shape)| conv(path.sub("conv").sub(i), shape))
-                .collect(),
-            output: conv(path.sub("output"), ConvShape::same(inputs, config.keypoints, 1)),
+            trunk: Trunk::new(path, 5, config),
+            output: he_uniform(&path.sub("output"), output),
             gamma: config.gamma,
             image_size,
         }
@@ -69,14 +90,8 @@ impl Detector {
 
     /// Keypoints of frames in [0, 1], `[B, 3, H, W]`.
     pub fn forward(&self, frame: &Tensor) -> Keypoints {
-        let (batch, _, height, width) = frame.size4().expect("frames have four axes");
-        let (x, y) = coordinates(height, width, frame);
-        let plane = [batch, 1, height, width];
-        let x = x.view([1, 1, 1, width]).expand(plane, false);
-        let y = y.view([1, 1, height, 1]).expand(plane, false);
-        let input = Tensor::cat(&[&(frame - 0.5), &x, &y], 1);
-        let features =
-            self.convs.iter().fold(input, |x, conv| Activation::LeakyRelu.apply(&conv.forward(&x)));
+        let input = Tensor::cat(&[&(frame - 0.5), &planes(frame)], 1);
+        let features = self.trunk.forward(&input);
         let heatmaps = self.output.forward(&features).softplus();
         let points = points(&heatmaps);
         Keypoints { heatmaps, points }
@@ -97,9 +112,19 @@ impl Detector {
 }
 
 /// x from left to right and y from top to bottom, as the keypoints measure them.
-pub fn coordinates(height: i64, width: i64, like: &Tensor) -> (Tensor, Tensor) {
+pub(super) fn coordinates(height: i64, width: i64, like: &Tensor) -> (Tensor, Tensor) {
     let options = (Kind::Float, like.device());
     (Tensor::linspace(-1, 1, width, options), Tensor::linspace(1, -1, height, options))
+}
+
+/// Both coordinates as planes beside an image batch `[B, C, h, w]`, `[B, 2, h, w]`.
+pub(super) fn planes(like: &Tensor) -> Tensor {
+    let (batch, _, height, width) = like.size4().expect("images have four axes");
+    let (x, y) = coordinates(height, width, like);
+    let plane = [batch, 1, height, width];
+    let x = x.view([1, 1, 1, width]).expand(plane, false);
+    let y = y.view([1, 1, height, 1]).expand(plane, false);
+    Tensor::cat(&[x, y], 1)
 }
 
 /// Centres of mass and relative strengths of heatmaps `[B, N, h, w]`, `[B, N, 3]`.
@@ -117,7 +142,7 @@ fn points(heatmaps: &Tensor) -> Tensor {
 }
 
 /// One Gaussian per keypoint, as high as it is strong, `[B, N, side, side]`.
-pub fn gaussian_maps(points: &Tensor, side: i64) -> Tensor {
+pub(super) fn gaussian_maps(points: &Tensor, side: i64) -> Tensor {
     let (x, y) = coordinates(side, side, points);
     let part = |i: i64| points.narrow(-1, i, 1).unsqueeze(-1); // [B, N, 1, 1]
     let squared =

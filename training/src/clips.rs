@@ -1,0 +1,167 @@
+//! Training data in memory: random crops of episodes as batches of tensors.
+
+use anyhow::{Context as _, ensure};
+use gatsbi_episodes::Dataset;
+use gatsbi_models::{noise::philox4x32_10, world_model::ActionDimension};
+use tch::{Device, Kind, Tensor};
+
+use crate::evaluation::Recorded;
+
+/// Episodes as bytes, with what the trainer derives from them once.
+#[derive(Debug)]
+pub struct Clips {
+    episodes: Vec<Episode>,
+    /// Per-pixel median over the data set, `[3, H, W]` in [0, 1].
+    pub median: Tensor,
+    /// Scaling of the actions.
+    pub actions: Vec<ActionDimension>,
+    /// Seconds between frames.
+    pub frame_period: f64,
+    scale: Tensor,
+}
+
+#[derive(Debug)]
+struct Episode {
+    frames: Tensor,  // [T, 3, H, W] u8
+    motion: Tensor,  // [T, H, W] u8
+    actions: Tensor, // [T, A] raw
+}
+
+/// A batch of sequences.
+#[derive(Debug)]
+pub struct Batch {
+    /// `[T]` frames of `[B, 3, H, W]` in [0, 1].
+    pub frames: Vec<Tensor>,
+    /// `[T]` scaled actions of `[B, A]`, each the one that led to its frame.
+    pub actions: Vec<Tensor>,
+    /// `[T]` motion maps of `[B, 1, H, W]` in [0, 1].
+    pub motion: Vec<Tensor>,
+}
+
+impl Clips {
+    /// Reads the episodes `range` of a data set.
+    pub fn read(dataset: &Dataset, range: std::ops::Range<usize>) -> anyhow::Result<Self> {
+        let info = dataset.info();
+        let (height, width) = (i64::from(info.height), i64::from(info.width));
+        ensure!(!range.is_empty() && range.end <= dataset.len(), "there are no such episodes");
+        let mut read = Vec::new();
+        for index in range {
+            let episode = dataset.read(index).with_context(|| format!("episode {index}"))?;
+            let data = episode.data();
+            let length = i64::from(data.length);
+            let frames = Tensor::from_slice(&data.rgb).view([length, height, width, 3]);
+            let frames = frames.permute([0, 3, 1, 2]).contiguous();
+            let actions = Tensor::from_slice(&data.actions).view([length, -1]);
+            read.push((frames, actions));
+        }
+        let median = median(&read);
+        let episodes: Vec<Episode> = read
+            .into_iter()
+            .map(|(frames, actions)| {
+                let motion = motion(&frames, &median);
+                Episode { frames, motion, actions }
+            })
+            .collect();
+        let all = Tensor::cat(&episodes.iter().map(|e| &e.actions).collect::<Vec<_>>(), 0);
+        let std: Vec<f32> = all.std_dim(Some([0i64].as_slice()), true, false).try_into()?;
+        let actions: Vec<ActionDimension> = info
+            .actions
+            .iter()
+            .zip(&std)
+            .map(|(dimension, std)| ActionDimension {
+                name: dimension.name.clone(),
+                unit: dimension.unit.clone(),
+                offset: 0.0,
+                scale: f64::from(std.max(1e-6)),
+            })
+            .collect();
+        let scale: Vec<f32> = actions.iter().map(|action| action.scale as f32).collect();
+        Ok(Self {
+            episodes,
+            median: median.to_kind(Kind::Float) / 255.0,
+            actions,
+            frame_period: info.frame_period_seconds,
+            scale: Tensor::from_slice(&scale),
+        })
+    }
+
+    /// Number of episodes.
+    pub fn len(&self) -> usize {
+        self.episodes.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.episodes.is_empty()
+    }
+
+    /// The first `length` frames of episodes with raw actions, as an evaluation wants them.
+    pub fn recorded(&self, episodes: &[usize], length: i64, device: Device) -> Recorded {
+        let stack = |part: &dyn Fn(&Episode) -> Tensor| {
+            let rows: Vec<Tensor> = episodes.iter().map(|&i| part(&self.episodes[i])).collect();
+            Tensor::stack(&rows, 1).to_device(device).unbind(0) // [T][B, ...]
+        };
+        let frames = stack(&|e| e.frames.narrow(0, 0, length).to_kind(Kind::Float) / 255.0);
+        let actions = stack(&|e| {
+            let none = e.actions.narrow(0, 0, 1).zeros_like();
+            Tensor::cat(&[none, e.actions.narrow(0, 0, length - 1)], 0)
+        });
+        Recorded { frames, actions, labels: None }
+    }
+
+    /// The batch of step `step`: a function of its arguments alone.
+    pub fn batch(&self, seed: u64, step: u64, batch: i64, length: i64, device: Device) -> Batch {
+        let key = [seed as u32, (seed >> 32) as u32];
+        let mut rows = Vec::new();
+        for row in 0..batch {
+            let counter = [row as u32, 0x636c_6970, step as u32, (step >> 32) as u32];
+            let [episode, start, neutral, _] = philox4x32_10(counter, key);
+            let episode = &self.episodes[episode as usize % self.episodes.len()];
+            let starts = episode.frames.size()[0] - length + 1;
+            rows.push((episode, i64::from(start) % starts, neutral % 2 == 0));
+        }
+        let stack = |part: &dyn Fn(&Episode, i64) -> Tensor| {
+            let rows: Vec<Tensor> = rows.iter().map(|(e, start, _)| part(e, *start)).collect();
+            Tensor::stack(&rows, 1).to_device(device) // [T, B, ...]
+        };
+        let image = |x: Tensor| x.to_kind(Kind::Float) / 255.0;
+        let frames = image(stack(&|e, start| e.frames.narrow(0, start, length)));
+        let motion = image(stack(&|e, start| e.motion.narrow(0, start, length))).unsqueeze(2);
+        let actions: Vec<Tensor> = rows
+            .iter()
+            .map(|(e, start, neutral)| {
+                // Nothing led to the first frame of an episode: none, or the paper's convention.
+                let first = match (*start, neutral) {
+                    (0, true) => e.actions.narrow(0, 0, 1).zeros_like(),
+                    (0, false) => e.actions.narrow(0, 0, 1),
+                    (start, _) => e.actions.narrow(0, start - 1, 1),
+                };
+                Tensor::cat(&[first, e.actions.narrow(0, *start, length - 1)], 0)
+            })
+            .collect();
+        let actions = (Tensor::stack(&actions, 1) / &self.scale).to_device(device);
+        Batch { frames: frames.unbind(0), actions: actions.unbind(0), motion: motion.unbind(0) }
+    }
+}
+
+/// Per-pixel median over a sample of frames, `[3, H, W]` u8.
+fn median(episodes: &[(Tensor, Tensor)]) -> Tensor {
+    let every = episodes.len().div_ceil(100).max(1);
+    let sample: Vec<Tensor> = episodes
+        .iter()
+        .step_by(every)
+        .map(|(frames, _)| frames.slice(0, 0, frames.size()[0], 6))
+        .collect();
+    Tensor::cat(&sample, 0).median_dim(0, false).0
+}
+
+/// How much each pixel differs both from the data set's median and from the episode's: what is not background,
+/// and does not rest either. `[T, H, W]` u8.
+fn motion(frames: &Tensor, median: &Tensor) -> Tensor {
+    let float = |x: &Tensor| x.to_kind(Kind::Float);
+    let own = frames.median_dim(0, false).0;
+    let difference = |to: &Tensor| (float(frames) - float(to)).abs().amax(1, false) / 255.0;
+    let moved = difference(median).minimum(&difference(&own));
+    let map = ((moved - 0.18) * 25.0).sigmoid();
+    (map * 255.0).round().to_kind(Kind::Uint8)
+}

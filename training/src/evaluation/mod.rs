@@ -1,0 +1,109 @@
+//! Evaluation: five frames observed, then imagination, against the recorded future and its ground truth.
+
+pub mod decomposition;
+pub mod picture;
+
+use anyhow::Context as _;
+use gatsbi_episodes::{Dataset, Episode};
+use gatsbi_models::{
+    noise::PhiloxNoise,
+    scene::{Output, Outputs, Scene},
+    world_model::WorldModel,
+};
+use tch::{Device, Kind, Tensor};
+
+/// Frames that are observed before imagining starts (paper's protocol).
+pub const CONDITIONING: usize = 5;
+
+/// Episodes as a batch, cut to the same length.
+#[derive(Debug)]
+pub struct Recorded {
+    /// `[T]` frames of `[B, 3, H, W]` in [0, 1].
+    pub frames: Vec<Tensor>,
+    /// `[T]` raw actions of `[B, A]`: `actions[t]` led to frame t, the first is neutral.
+    pub actions: Vec<Tensor>,
+    /// `[T]` labels of `[B, H, W]` int64, where the data has them.
+    pub labels: Option<Vec<Tensor>>,
+}
+
+impl Recorded {
+    /// The first `length` frames of episodes.
+    pub fn read(
+        dataset: &Dataset,
+        episodes: &[usize],
+        length: usize,
+        neutral: &[f32],
+        device: Device,
+    ) -> anyhow::Result<Self> {
+        let read: Vec<Episode> = episodes
+            .iter()
+            .map(|&index| dataset.read(index).with_context(|| format!("episode {index}")))
+            .collect::<Result<_, _>>()?;
+        let info = dataset.info();
+        let (height, width) = (i64::from(info.height), i64::from(info.width));
+        let per_frame = |part: &dyn Fn(&Episode, usize) -> Tensor| -> Vec<Tensor> {
+            (0..length)
+                .map(|t| {
+                    let rows: Vec<Tensor> = read.iter().map(|e| part(e, t)).collect();
+                    Tensor::stack(&rows, 0).to_device(device)
+                })
+                .collect()
+        };
+        let frames = per_frame(&|e, t| {
+            let frame = Tensor::from_slice(e.frame(t)).view([height, width, 3]);
+            frame.permute([2, 0, 1]).to_kind(Kind::Float) / 255.0
+        });
+        let actions = per_frame(&|e, t| match t.checked_sub(1) {
+            Some(before) => Tensor::from_slice(e.action(before)),
+            None => Tensor::from_slice(neutral),
+        });
+        let labelled = read.iter().all(|e| e.mask(0).is_some());
+        let labels = labelled.then(|| {
+            per_frame(&|e, t| {
+                let mask = e.mask(t).expect("every episode has masks");
+                Tensor::from_slice(mask).view([height, width]).to_kind(Kind::Int64)
+            })
+        });
+        Ok(Self { frames, actions, labels })
+    }
+}
+
+/// Observes the first frames and imagines the rest in mean mode, with `actions` from then on.
+pub fn rollout(
+    world: &dyn WorldModel,
+    recorded: &Recorded,
+    actions: &[Tensor],
+    wanted: Outputs,
+) -> Vec<Scene> {
+    let batch = recorded.frames[0].size()[0];
+    let noise = PhiloxNoise::mean(batch, world.device());
+    let mut state = world.initial_state(batch);
+    let mut scenes = Vec::new();
+    for (t, action) in actions.iter().enumerate() {
+        let (next, scene) = if t < CONDITIONING {
+            world.observe(&state, Some(&recorded.frames[t]), action, &noise, wanted)
+        } else {
+            world.imagine(&state, action, &noise, wanted)
+        };
+        state = next;
+        scenes.push(scene);
+    }
+    scenes
+}
+
+/// What the evaluation asks a model for.
+pub fn wanted() -> Outputs {
+    Outputs::from_iter([
+        Output::Frame,
+        Output::SlotMasks,
+        Output::ObjectMasks,
+        Output::Objects,
+        Output::Background,
+    ])
+}
+
+/// Peak signal-to-noise ratio in dB of images in [0, 1], `[B]`.
+pub fn psnr(image: &Tensor, truth: &Tensor) -> Tensor {
+    let error = (image.clamp(0.0, 1.0) - truth).square().mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
+    error.clamp_min(1e-10).log10() * -10.0
+}

@@ -1,0 +1,297 @@
+//! The training objective of a batch of sequences (mixture spec 5, object spec 3.8 and 6.8).
+
+use gatsbi_models::{
+    config::{DiscoveryPolicy, IdRule, PresenceRule, Tracking},
+    gatsbi::{
+        keypoint::{KeypointLearning, Keypoints},
+        loss,
+        mixture::MixtureStep,
+        model::{Gatsbi, GatsbiState, GatsbiStep, GradientStops, Observing},
+        objects::Discover,
+    },
+    noise::{Noise, PhiloxNoise, RowNoise, Site, philox4x32_10},
+};
+use tch::{Device, Kind, Tensor};
+
+use crate::{
+    clips::Batch,
+    recipe::{KeypointRecipe, ObjectRecipe, Recipe},
+};
+
+/// Where a run is: everything random about a step is a function of this.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Optimiser step.
+    pub step: u64,
+}
+
+/// Loss of a batch: mean over sequences, summed over time.
+#[derive(Debug)]
+pub struct Objective {
+    /// What is minimised.
+    pub loss: Tensor,
+    /// Its terms by name, unweighted and detached, summed over time.
+    pub terms: Vec<(&'static str, Tensor)>,
+}
+
+/// Weighted terms on their way to a loss.
+struct Terms {
+    entries: Vec<(&'static str, Tensor, f64)>,
+}
+
+impl Terms {
+    /// Adds a term of `[B]`.
+    fn add(&mut self, name: &'static str, value: Tensor, weight: f64) {
+        match self.entries.iter_mut().find(|(known, _, _)| *known == name) {
+            Some((_, sum, _)) => *sum = &*sum + value,
+            None => self.entries.push((name, value, weight)),
+        }
+    }
+
+    fn finish(self, like: &Tensor) -> Objective {
+        let mut loss = Tensor::zeros([1], (Kind::Float, like.device()));
+        let mut terms = Vec::new();
+        for (name, value, weight) in self.entries {
+            let mean = value.mean(Kind::Float);
+            terms.push((name, mean.detach()));
+            if weight != 0.0 {
+                loss = loss + mean * weight;
+            }
+        }
+        Objective { loss: loss.sum(Kind::Float), terms }
+    }
+}
+
+/// How objects are tracked in training: presence is the original product, and new objects come as told.
+pub fn training_tracking() -> Tracking {
+    Tracking {
+        discovery: DiscoveryPolicy::EveryFrame,
+        presence: PresenceRule::Product,
+        ids: IdRule::Monotone,
+        scale_bounds: None,
+    }
+}
+
+/// Noise of frame `t` of a step.
+pub fn noise(moment: Moment, t: usize, batch: i64, device: Device) -> PhiloxNoise {
+    let rows = (0..batch)
+        .map(|row| RowNoise::Sample {
+            seed: moment.seed,
+            sample: row as u32,
+            step: moment.step << 8 | t as u64,
+        })
+        .collect();
+    PhiloxNoise::new(rows, device)
+}
+
+/// Noise whose part for the mixture's latents is scaled.
+struct DampedNoise {
+    noise: PhiloxNoise,
+    factor: f64,
+}
+
+impl Noise for DampedNoise {
+    fn normal(&self, site: Site, shape: &[i64]) -> Tensor {
+        let noise = self.noise.normal(site, shape);
+        match site {
+            Site::Mask | Site::Component => noise * self.factor,
+            _ => noise,
+        }
+    }
+
+    fn uniform(&self, site: Site, shape: &[i64]) -> Tensor {
+        self.noise.uniform(site, shape)
+    }
+}
+
+/// The loss of a batch.
+pub fn objective(
+    model: &Gatsbi,
+    learning: Option<&KeypointLearning>,
+    recipe: &Recipe,
+    batch: &Batch,
+    moment: Moment,
+) -> Objective {
+    let step = moment.step;
+    let mut terms = Terms { entries: Vec::new() };
+    let keypoints = recipe.keypoints.as_ref().filter(|keypoints| step < keypoints.end);
+    let gamma = match (keypoints, learning, model.detector()) {
+        (Some(weights), Some(learning), Some(detector)) => {
+            let found: Vec<Keypoints> =
+                batch.frames.iter().map(|frame| detector.forward(frame)).collect();
+            add_keypoints(&mut terms, model, learning, weights, batch, &found, moment);
+            Some(found.iter().map(|found| detector.gamma(found)).collect::<Vec<_>>())
+        }
+        _ => None,
+    };
+    if step >= recipe.mixture.start {
+        add_scene(&mut terms, model, recipe, batch, gamma.as_deref(), moment);
+    }
+    terms.finish(&batch.frames[0])
+}
+
+fn add_keypoints(
+    terms: &mut Terms,
+    model: &Gatsbi,
+    learning: &KeypointLearning,
+    weights: &KeypointRecipe,
+    batch: &Batch,
+    found: &[Keypoints],
+    moment: Moment,
+) {
+    let rows = batch.frames[0].size()[0];
+    let device = batch.frames[0].device();
+    let networks = &weights.networks;
+    let actions: Vec<Tensor> = batch.actions.iter().map(|action| model.enhance(action)).collect();
+    // Keypoints draw from a stream of their own.
+    let moment = Moment { seed: !moment.seed, ..moment };
+    let noise: Vec<Tensor> = (0..batch.frames.len())
+        .map(|t| {
+            let shape = [rows, networks.samples, networks.latent];
+            noise(moment, t, rows, device).normal(Site::Mask, &shape).transpose(0, 1)
+        })
+        .collect();
+    let losses = learning.losses(&batch.frames, found, &actions, &noise);
+    let per_row = |x: Tensor| x.expand([rows], false);
+    terms.add("kp_image", per_row(losses.image), 1.0);
+    terms.add("kp_separation", per_row(losses.separation), weights.separation);
+    terms.add("kp_sparsity", per_row(losses.sparsity), weights.sparsity);
+    terms.add("kp_dynamics", per_row(losses.dynamics), 1.0);
+    terms.add("kp_kl", per_row(losses.kl), weights.kl.at(moment.step));
+}
+
+/// Mixture and objects over the sequence.
+fn add_scene(
+    terms: &mut Terms,
+    model: &Gatsbi,
+    recipe: &Recipe,
+    batch: &Batch,
+    gamma: Option<&[Tensor]>,
+    moment: Moment,
+) {
+    let rows = batch.frames[0].size()[0];
+    let device = batch.frames[0].device();
+    let objects = recipe.objects.as_ref().filter(|objects| moment.step >= objects.start);
+    let mut state = model.initial_state(rows);
+    for (t, frame) in batch.frames.iter().enumerate() {
+        let first = state.first();
+        let dropout = objects.map_or(0.0, |objects| objects.discovery_dropout);
+        let discover =
+            if t > 0 && dropped(moment, t, dropout) { Discover::None } else { Discover::All };
+        let how = Observing {
+            train: true,
+            priors: true,
+            objects: objects.is_some(),
+            discover,
+            tracking: training_tracking(),
+            stops: GradientStops::default(),
+        };
+        let noise = DampedNoise {
+            noise: noise(moment, t, rows, device),
+            factor: recipe.mixture.noise.at(moment.step),
+        };
+        let (next, seen) = model.observe(state, frame, &batch.actions[t], &noise, how);
+        state = next;
+        add_mixture(terms, recipe, &seen.mixture, frame, &first, moment.step);
+        if let Some(slot) = model.agent_slot() {
+            let agent = seen.mixture.log_masks.select(1, slot).exp();
+            let motion = loss::keypoint_regression(&batch.motion[t], &agent);
+            terms.add("to_motion", motion, recipe.regression.motion.at(moment.step));
+            if let Some(gamma) = gamma {
+                let keypoints = loss::keypoint_regression(&gamma[t], &agent);
+                terms.add("to_keypoints", keypoints, recipe.regression.keypoints.at(moment.step));
+            }
+        }
+        if let Some(objects) = objects {
+            add_objects(terms, model, objects, &state, &seen, frame, &first, moment.step);
+        }
+    }
+}
+
+fn add_mixture(
+    terms: &mut Terms,
+    recipe: &Recipe,
+    mixture: &MixtureStep,
+    frame: &Tensor,
+    first: &Tensor,
+    step: u64,
+) {
+    let recipe = &recipe.mixture;
+    let (mask, comp) = loss::mixture_kl(mixture);
+    let kl = recipe.kl.at(step);
+    terms.add("kl_mask", mask, kl);
+    terms.add("kl_comp", comp, kl);
+    terms.add("residual", loss::residual_norm(mixture, first), recipe.residual);
+    let weight = recipe.likelihood.at(step);
+    if weight > 0.0 {
+        let (masks, components) = (&mixture.log_masks, &mixture.components);
+        let likelihood = loss::mixture_log_likelihood(frame, masks, components, recipe.sigma);
+        terms.add("nll_mixture", -likelihood, weight);
+    }
+}
+
+#[expect(clippy::too_many_arguments, reason = "a step and its weights")]
+fn add_objects(
+    terms: &mut Terms,
+    model: &Gatsbi,
+    recipe: &ObjectRecipe,
+    state: &GatsbiState,
+    seen: &GatsbiStep,
+    frame: &Tensor,
+    first: &Tensor,
+    step: u64,
+) {
+    let mixture = &seen.mixture;
+    let rendering = model.render(state);
+    let window = recipe.fixed_alpha.filter(|window| step < window.end);
+    let weight = recipe.composite.at(step);
+    if weight > 0.0 {
+        let image = match window {
+            Some(window) => {
+                loss::fixed_alpha_image(&rendering.foreground, &mixture.mu_mix, window.value)
+            }
+            None => rendering.over(&mixture.mu_mix),
+        };
+        let likelihood = loss::gaussian_log_likelihood(frame, &image, recipe.sigma);
+        terms.add("nll", -likelihood, weight);
+    }
+    let weight = recipe.joint.at(step);
+    if weight > 0.0 {
+        let alpha = match window {
+            Some(window) => rendering.alpha.full_like(window.value),
+            None => rendering.alpha.shallow_clone(),
+        };
+        let likelihood = loss::joint_log_likelihood(
+            frame,
+            &rendering.colour(),
+            &alpha,
+            &mixture.log_masks,
+            &mixture.components,
+            recipe.sigma,
+        );
+        terms.add("nll_joint", -likelihood, weight);
+    }
+    let config = &model.config().objects;
+    let mut prior = config.prior.clone();
+    prior.scale_mean = recipe.scale_mean.at(step);
+    let objects = seen.objects.as_ref().expect("objects were observed");
+    let kl = objects.kl(first, &prior, config.aux_presence_kl);
+    let weight = recipe.kl.at(step);
+    terms.add("kl_pres", kl.pres, weight);
+    terms.add("kl_where", kl.place, weight);
+    terms.add("kl_depth", kl.depth, weight);
+    terms.add("kl_what", kl.what, weight);
+    terms.add("kl_dyna", kl.dyna, weight);
+    let alpha = rendering.alpha.mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
+    terms.add("alpha", alpha, 0.0);
+}
+
+/// Whether discovery is dropped at frame `t`, for the whole batch.
+fn dropped(moment: Moment, t: usize, probability: f64) -> bool {
+    let key = [moment.seed as u32, (moment.seed >> 32) as u32];
+    let step = moment.step;
+    let counter = [t as u32, 0x6472_6f70, step as u32, (step >> 32) as u32];
+    f64::from(philox4x32_10(counter, key)[0]) < probability * f64::from(u32::MAX)
+}

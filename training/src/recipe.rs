@@ -1,0 +1,168 @@
+//! A recipe: everything that decides a training run but the data, as one TOML file.
+
+use gatsbi_models::gatsbi::keypoint::KeypointLearningConfig;
+use serde::{Deserialize, Serialize};
+
+/// How a model is trained.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Name of the resulting checkpoint.
+    pub name: String,
+    /// Architecture preset.
+    pub model: String,
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Sequences per step.
+    pub batch: i64,
+    /// Frames per sequence, from the given step on.
+    pub length: Staircase,
+    /// Learning rate, from the given step on.
+    pub learning_rate: Staircase,
+    /// Largest global norm of a gradient.
+    pub clip: f64,
+    /// Background fit before the first step.
+    pub prefit: Option<Prefit>,
+    /// Mixture module.
+    pub mixture: MixtureRecipe,
+    /// Object module; none are trained without it.
+    pub objects: Option<ObjectRecipe>,
+    /// What tells which pixels are the agent's.
+    pub regression: RegressionRecipe,
+    /// Keypoint module; none is trained without it.
+    pub keypoints: Option<KeypointRecipe>,
+    /// Steps between pictures.
+    pub picture_every: u64,
+    /// Steps between checkpoints.
+    pub save_every: u64,
+}
+
+/// Terms of the keypoint module (mixture spec 4).
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeypointRecipe {
+    /// First step without keypoint losses.
+    pub end: u64,
+    /// Weight of the separation of trajectories.
+    pub separation: f64,
+    /// Weight of the sparsity of heatmaps.
+    pub sparsity: f64,
+    /// Weight of the dynamics' KL.
+    pub kl: Ramp,
+    /// Sizes of the networks.
+    pub networks: KeypointLearningConfig,
+}
+
+/// The last slot's component is fitted to the data's per-pixel median through its own posterior.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Prefit {
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Learning rate.
+    pub learning_rate: f64,
+}
+
+/// Terms of the mixture module.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct MixtureRecipe {
+    /// First step with the mixture.
+    pub start: u64,
+    /// Standard deviation of the log-sum-exp likelihood.
+    pub sigma: f64,
+    /// Weight of that likelihood.
+    pub likelihood: Ramp,
+    /// Weight of the KLs.
+    pub kl: Ramp,
+    /// Weight of the residual norms.
+    pub residual: f64,
+    /// Factor on the noise of the latents. Starting from 0 lets the latents say something before noise drowns
+    /// it.
+    pub noise: Ramp,
+}
+
+/// Terms of the object module.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectRecipe {
+    /// First step with objects.
+    pub start: u64,
+    /// Standard deviation of both likelihoods below.
+    pub sigma: f64,
+    /// Weight of the Gaussian likelihood of the composite image.
+    pub composite: Ramp,
+    /// Weight of the likelihood in which objects and slots compete for pixels.
+    pub joint: Ramp,
+    /// Weight of the KLs.
+    pub kl: Ramp,
+    /// Constant alpha of the composite and the step it ends.
+    pub fixed_alpha: Option<FixedAlpha>,
+    /// Probability of discovering nothing at a frame after the first.
+    pub discovery_dropout: f64,
+    /// Mean of the raw scale in the discovery prior.
+    pub scale_mean: Ramp,
+}
+
+/// The fixed-alpha window.
+#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct FixedAlpha {
+    /// The constant.
+    pub value: f64,
+    /// First step without it.
+    pub end: u64,
+}
+
+/// Onto which maps the agent's mask is regressed, and with which weights of the squared difference.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct RegressionRecipe {
+    /// The keypoint map (the paper's).
+    pub keypoints: Ramp,
+    /// The motion map: what differs both from the data's and from the episode's median. It leads where
+    /// keypoints learn too slowly; it contains moving objects too.
+    pub motion: Ramp,
+}
+
+/// A number that is linear between given steps and constant outside.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Ramp {
+    /// The same at every step.
+    Constant(f64),
+    /// `[step, value]` pairs by increasing step.
+    Points(Vec<(u64, f64)>),
+}
+
+impl Ramp {
+    /// The value at `step`.
+    pub fn at(&self, step: u64) -> f64 {
+        match self {
+            Self::Constant(value) => *value,
+            Self::Points(points) => {
+                let after = points.partition_point(|(at, _)| *at <= step);
+                match (after.checked_sub(1).map(|i| points[i]), points.get(after)) {
+                    (Some((from, low)), Some(&(to, high))) => {
+                        low + (high - low) * (step - from) as f64 / (to - from) as f64
+                    }
+                    (Some((_, value)), None) => value,
+                    (None, Some(&(_, value))) => value,
+                    (None, None) => 0.0,
+                }
+            }
+        }
+    }
+}
+
+/// A number that changes at given steps: `[step, value]` pairs by increasing step.
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+pub struct Staircase(Vec<(u64, f64)>);
+
+impl Staircase {
+    /// The value at `step`.
+    pub fn at(&self, step: u64) -> f64 {
+        let after = self.0.partition_point(|(at, _)| *at <= step);
+        self.0[after.saturating_sub(1)].1
+    }
+}

@@ -1,0 +1,308 @@
+//! A training run: prefit, steps, pictures, checkpoints; stopped and resumed at will.
+
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::{Context as _, bail, ensure};
+use gatsbi_models::{
+    checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
+    config::presets,
+    gatsbi::{
+        keypoint::KeypointLearning,
+        model::{GradientStops, Observing},
+        objects::Discover,
+        world::GatsbiWorld,
+    },
+    nn::ParamStore,
+    world_model::WorldModel as _,
+};
+use tch::{Device, Kind};
+
+use crate::{
+    adam::Adam,
+    clips::{Batch, Clips},
+    evaluation::{self, Recorded},
+    journal::Journal,
+    objective::{Moment, noise, objective, training_tracking},
+    recipe::Recipe,
+    saved::{self, Progress},
+    untrained,
+};
+
+/// Steps in a row without a finite loss after which a run gives up.
+const MAX_SKIPPED_IN_A_ROW: u64 = 5;
+
+/// Batches whose statistics replace the running ones before a checkpoint is written for users.
+const RECALIBRATION_BATCHES: u64 = 30;
+
+/// Optimiser steps of the prefit draw from steps of their own, far from those of the run.
+const PREFIT_STEPS: u64 = 1 << 40;
+
+/// A run in progress.
+#[derive(Debug)]
+pub struct Trainer {
+    recipe: Recipe,
+    device: Device,
+    folder: PathBuf,
+    checkpoint: Checkpoint,
+    learning: Option<KeypointLearning>,
+    learning_store: ParamStore,
+    adam: Adam,
+    progress: Progress,
+}
+
+impl Trainer {
+    /// Opens the run in `folder`: where it stopped, or from untrained weights. `data` names the data set.
+    ///
+    /// # Errors
+    /// If the recipe names an unknown architecture, or the folder holds a run of another recipe, seed or data.
+    pub fn open(
+        recipe: Recipe,
+        clips: &Clips,
+        data: &str,
+        seed: u64,
+        folder: &Path,
+        device: Device,
+    ) -> anyhow::Result<Self> {
+        fs_err::create_dir_all(folder)?;
+        let mut model = presets::preset(&recipe.model)
+            .with_context(|| format!("there is no architecture preset {}", recipe.model))?;
+        model.action.dim = clips.actions.len() as i64;
+        let mut header = untrained::header(&recipe.name, model, clips.actions.clone(), seed);
+        header.frame_period = Some(clips.frame_period);
+        let checkpoint = Checkpoint::untrained(header, device);
+        let mut learning_store = ParamStore::new(seed, device);
+        let config = checkpoint.model.config();
+        let learning = match (&recipe.keypoints, &config.detector) {
+            (Some(keypoints), Some(detector)) => Some(learning_store.build(|root| {
+                let path = root.sub("keypoints");
+                let action = config.action.enhanced;
+                KeypointLearning::new(&path, detector, &keypoints.networks, action)
+            })),
+            (Some(_), None) => bail!("the recipe trains keypoints, {} has none", recipe.model),
+            _ => None,
+        };
+        let mut trainer = Self {
+            progress: Progress {
+                step: 0,
+                seed,
+                seconds: 0.0,
+                skipped: 0,
+                recipe: recipe.clone(),
+                data: data.to_owned(),
+            },
+            recipe,
+            device,
+            folder: folder.to_path_buf(),
+            checkpoint,
+            learning,
+            learning_store,
+            adam: Adam::default(),
+        };
+        trainer.resume()?;
+        Ok(trainer)
+    }
+
+    /// Starts from the weights of a checkpoint of the same architecture, if the run has not begun.
+    ///
+    /// # Errors
+    /// If the checkpoint cannot be read or has another architecture.
+    pub fn start_from(&mut self, path: &Path) -> anyhow::Result<()> {
+        if self.progress.step == 0 {
+            let loaded = Checkpoint::load(path, self.device)?;
+            let same = loaded.header.model == self.checkpoint.header.model;
+            ensure!(same, "{} has another architecture", path.display());
+            let header = self.checkpoint.header.clone();
+            self.checkpoint = Checkpoint { header, ..loaded };
+            self.recipe.prefit = None;
+        }
+        Ok(())
+    }
+
+    /// Steps taken.
+    pub fn step(&self) -> u64 {
+        self.progress.step
+    }
+
+    /// Trains up to `until` or the end of the recipe.
+    ///
+    /// # Errors
+    /// If files cannot be written or the loss stays infinite.
+    pub fn run(&mut self, clips: &Clips, until: Option<u64>) -> anyhow::Result<()> {
+        let end = until.map_or(self.recipe.steps, |until| until.min(self.recipe.steps));
+        let mut journal = Journal::start(&self.folder, self.progress.step, self.recipe.steps)?;
+        if self.progress.step == 0 {
+            self.prefit(clips, &journal);
+        }
+        let mut skipped_in_a_row = 0;
+        while self.progress.step < end {
+            let started = Instant::now();
+            let moment = self.moment();
+            let length = self.recipe.length.at(moment.step) as i64;
+            let batch = self.batch(clips, moment.step, length);
+            let learning = self.learning.as_ref();
+            let objective =
+                objective(&self.checkpoint.model, learning, &self.recipe, &batch, moment);
+            let loss = objective.loss.double_value(&[]);
+            let mut norm = f64::NAN;
+            if loss.is_finite() {
+                objective.loss.backward();
+                let stores = [&self.checkpoint.store, &self.learning_store];
+                let rate = self.recipe.learning_rate.at(moment.step);
+                norm = self.adam.step(&stores, rate, self.recipe.clip);
+            }
+            self.progress.step += 1;
+            if norm.is_finite() {
+                skipped_in_a_row = 0;
+                let frames = length as f64;
+                let terms = objective.terms.iter();
+                let numbers = terms.map(|(name, value)| (*name, value.double_value(&[]) / frames));
+                let all = [("loss", loss / frames), ("norm", norm)].into_iter().chain(numbers);
+                journal.step(self.progress.step, frames * self.recipe.batch as f64, all)?;
+            } else {
+                self.progress.skipped += 1;
+                skipped_in_a_row += 1;
+                journal.say(&format!("step {}: no finite loss, skipped", self.progress.step));
+                ensure!(
+                    skipped_in_a_row < MAX_SKIPPED_IN_A_ROW,
+                    "{skipped_in_a_row} steps in a row had no finite loss: lower the learning \
+                     rate and go on from the last checkpoint"
+                );
+            }
+            self.progress.seconds += started.elapsed().as_secs_f64();
+            let every = |steps: u64| steps > 0 && self.progress.step % steps == 0;
+            if every(self.recipe.save_every) || self.progress.step == end {
+                self.save()?;
+            }
+            if every(self.recipe.picture_every) || self.progress.step == end {
+                self.picture(clips, &mut journal)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Where users find the result.
+    pub fn checkpoint_path(&self) -> PathBuf {
+        self.folder.join("checkpoint.safetensors")
+    }
+
+    fn state_path(&self) -> PathBuf {
+        self.folder.join("state.safetensors")
+    }
+
+    fn moment(&self) -> Moment {
+        Moment { seed: self.progress.seed, step: self.progress.step }
+    }
+
+    fn batch(&self, clips: &Clips, step: u64, length: i64) -> Batch {
+        clips.batch(self.progress.seed, step, self.recipe.batch, length, self.device)
+    }
+
+    fn resume(&mut self) -> anyhow::Result<()> {
+        let path = self.state_path();
+        if !path.exists() {
+            return Ok(());
+        }
+        let stores = [&self.checkpoint.store, &self.learning_store];
+        let saved = saved::load(&path, &stores, &mut self.adam)?;
+        let Progress { seed, data, recipe, .. } = &saved;
+        ensure!(*seed == self.progress.seed, "{} has seed {seed}", path.display());
+        ensure!(*data == self.progress.data, "{} is a run on {data}", path.display());
+        ensure!(
+            recipe.model == self.recipe.model && recipe.batch == self.recipe.batch,
+            "{} is a run of another recipe",
+            path.display()
+        );
+        self.progress = Progress { recipe: self.recipe.clone(), ..saved };
+        Ok(())
+    }
+
+    /// Fits the last slot's component to the data's median through its own posterior.
+    fn prefit(&self, clips: &Clips, journal: &Journal) {
+        let Some(prefit) = self.recipe.prefit else { return };
+        let model = &self.checkpoint.model;
+        let last = model.config().mixture.slots - 1;
+        let median = clips.median.to_device(self.device).unsqueeze(0);
+        let rows = self.recipe.batch;
+        // The encoders must not learn to ignore the frame, which a constant target would teach them.
+        let mut adam = Adam::only("mixture.comp_decoder");
+        for step in PREFIT_STEPS..PREFIT_STEPS + prefit.steps {
+            let batch = self.batch(clips, step, 1);
+            let how = Observing {
+                train: true,
+                priors: false,
+                objects: false,
+                discover: Discover::None,
+                tracking: training_tracking(),
+                stops: GradientStops::default(),
+            };
+            let noise = noise(Moment { step, ..self.moment() }, 0, rows, self.device);
+            let state = model.initial_state(rows);
+            let (_, seen) = model.observe(state, &batch.frames[0], &batch.actions[0], &noise, how);
+            let error = (seen.mixture.components.select(1, last) - &median).square();
+            let loss = error.sum(Kind::Float) / rows as f64;
+            loss.backward();
+            adam.step(&[&self.checkpoint.store], prefit.learning_rate, self.recipe.clip * 10.0);
+            if step + 1 == PREFIT_STEPS + prefit.steps {
+                let error = loss.double_value(&[]) / median.numel() as f64;
+                journal.say(&format!("background prefit: mean squared error {error:.5}"));
+            }
+        }
+    }
+
+    /// Replaces running statistics by those of the present weights.
+    fn recalibrate(&self, clips: &Clips) {
+        let _no_grad = tch::no_grad_guard();
+        for i in 0..RECALIBRATION_BATCHES {
+            let step = 2 * PREFIT_STEPS + i;
+            let length = self.recipe.length.at(self.progress.step) as i64;
+            let batch = self.batch(clips, step, length);
+            let recipe = &self.recipe;
+            // The objective runs every network in training mode, which is what moves the statistics.
+            let recipe = Recipe { keypoints: None, ..recipe.clone() };
+            let moment = Moment { step, ..self.moment() };
+            objective(&self.checkpoint.model, None, &recipe, &batch, moment);
+        }
+    }
+
+    fn save(&self) -> anyhow::Result<()> {
+        let stores = [&self.checkpoint.store, &self.learning_store];
+        saved::save(&self.state_path(), &stores, &self.adam, &self.progress)
+    }
+
+    /// Writes the checkpoint that users see.
+    fn export(&self) -> anyhow::Result<()> {
+        let agent_slot = self.checkpoint.header.agent_slot.clone();
+        let header = Header {
+            agent_slot: agent_slot.map(|slot| AgentSlot { score: None, ..slot }),
+            provenance: Provenance {
+                data: self.progress.data.clone(),
+                seed: self.progress.seed,
+                steps: self.progress.step,
+                preset: self.recipe.name.clone(),
+                notes: String::new(),
+            },
+            ..self.checkpoint.header.clone()
+        };
+        let path = self.checkpoint_path();
+        checkpoint::save(&self.checkpoint.store, &header, &path, Precision::Single)?;
+        Ok(())
+    }
+
+    fn picture(&self, clips: &Clips, journal: &mut Journal) -> anyhow::Result<()> {
+        self.export()?;
+        let world = GatsbiWorld::load(&self.checkpoint_path(), self.device)?;
+        let recorded: Recorded = clips.recorded(&[0, clips.len() / 2], 20, self.device);
+        let scenes =
+            evaluation::rollout(&world, &recorded, &recorded.actions, evaluation::wanted());
+        let path = self.folder.join(format!("step-{:07}.png", self.progress.step));
+        let agent = world.spec().agent_slot;
+        evaluation::picture::write(&path, &recorded, &scenes, agent, 1)?;
+        let png = fs_err::read(&path)?;
+        let size = image::image_dimensions(&path)?;
+        journal.events().picture(self.progress.step, "rollout", &png, [size.1, size.0])?;
+        Ok(())
+    }
+}
