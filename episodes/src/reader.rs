@@ -1,6 +1,6 @@
 //! Reads a data set: one Parquet file, or a folder with its manifest.
 //!
-//! [`Dataset::read`] decodes one row group and nothing else; [`Dataset::summaries`] and [`Dataset::statistics`] never touch
+//! [`Dataset::read`] decodes one row group and nothing else; [`Dataset::summaries`] and [`Dataset::action_statistics`] never touch
 //! pixels. A data set can be shared by threads. For training there is [`crate::Prefetch`], which reads ahead in the background.
 
 use std::path::{Path, PathBuf};

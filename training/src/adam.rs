@@ -83,8 +83,10 @@ impl Adam {
             .collect();
         let (with_gradient, idle): (Vec<_>, Vec<_>) =
             with_gradient.into_iter().partition(|(name, _, _)| name.starts_with(self.only));
-        let squares: Vec<Tensor> =
-            with_gradient.iter().map(|(_, _, gradient)| gradient.square().sum(Kind::Float)).collect();
+        let squares: Vec<Tensor> = with_gradient
+            .iter()
+            .map(|(_, _, gradient)| gradient.square().sum(Kind::Float))
+            .collect();
         let norm = Tensor::stack(&squares, 0).sum(Kind::Double).double_value(&[]).sqrt();
         if norm.is_finite() {
             let factor = (clip / (norm + 1e-6)).min(1.0);
@@ -114,8 +116,6 @@ impl Moments {
         let bias1 = 1.0 - BETA1.powi(self.steps as i32);
         let bias2 = (1.0 - BETA2.powi(self.steps as i32)).sqrt();
         let denominator = self.second.sqrt() / bias2 + EPS;
-        let _ = parameter
-            .shallow_clone()
-            .g_sub_(&(&self.first / denominator * (rate / bias1)));
+        let _ = parameter.shallow_clone().g_sub_(&(&self.first / denominator * (rate / bias1)));
     }
 }

@@ -55,7 +55,13 @@ impl Events {
     ///
     /// # Errors
     /// Of the file system.
-    pub fn picture(&mut self, step: u64, tag: &str, png: &[u8], size: [u32; 2]) -> std::io::Result<()> {
+    pub fn picture(
+        &mut self,
+        step: u64,
+        tag: &str,
+        png: &[u8],
+        size: [u32; 2],
+    ) -> std::io::Result<()> {
         const RGB: u64 = 3;
         let mut image = Message::default();
         image.varint(1, u64::from(size[0]));

@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::events::Events;
 
 /// Seconds between lines where there is no terminal.
-const LINE_EVERY: Duration = Duration::from_secs(60);
+const LINE_EVERY: Duration = Duration::from_mins(1);
 
 /// Steps between points in the event files.
 const POINT_EVERY: u64 = 20;
@@ -68,9 +68,10 @@ impl Journal {
             *entry = (entry.0 + value, entry.1 + 1.0);
         }
         self.frames += frames;
-        if step % POINT_EVERY == 0 {
+        if step.is_multiple_of(POINT_EVERY) {
             let sums = std::mem::take(&mut self.sums);
-            self.recent = sums.into_iter().map(|(name, (sum, count))| (name, sum / count)).collect();
+            self.recent =
+                sums.into_iter().map(|(name, (sum, count))| (name, sum / count)).collect();
             self.events.scalars(step, self.recent.iter().map(|(name, value)| (*name, *value)))?;
         }
         let rate = self.frames / self.frames_since.elapsed().as_secs_f64();
@@ -79,7 +80,11 @@ impl Journal {
             bar.set_message(format!("{rate:.0} frames/s  {}", self.numbers()));
         } else if self.said.elapsed() >= LINE_EVERY || step == self.steps {
             self.said = Instant::now();
-            self.say(&format!("step {step}/{}  {rate:.0} frames/s  {}", self.steps, self.numbers()));
+            self.say(&format!(
+                "step {step}/{}  {rate:.0} frames/s  {}",
+                self.steps,
+                self.numbers()
+            ));
             (self.frames, self.frames_since) = (0.0, Instant::now());
         }
         Ok(())

@@ -2,17 +2,29 @@
 
 #![expect(clippy::print_stdout, reason = "a command-line program speaks to people")]
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, bail};
 use clap::{Parser, Subcommand};
+use gatsbi_episodes::Dataset;
 use gatsbi_models::{
     checkpoint::{Checkpoint, Precision},
     config::presets,
+    gatsbi::world::GatsbiWorld,
+    world_model::WorldModel as _,
 };
-use gatsbi_episodes::Dataset;
-use gatsbi_training::{clips::Clips, recipe::Recipe, trainer::Trainer, untrained};
+use gatsbi_training::{
+    clips::Clips,
+    evaluation::{CONDITIONING, Recorded, picture, report::report, rollout, wanted},
+    recipe::Recipe,
+    trainer::Trainer,
+    untrained,
+};
+use indicatif::ProgressBar;
 use tch::Device;
+
+/// Steps imagined by an evaluation.
+const HORIZON: usize = 15;
 
 /// Makes, trains and evaluates GATSBI checkpoints.
 #[derive(Debug, Parser)]
@@ -68,7 +80,10 @@ enum Command {
         /// Episodes from and up to (excluded).
         #[arg(long, num_args = 2)]
         range: Option<Vec<usize>>,
-        /// Picture to write.
+        /// File for all numbers.
+        #[arg(long)]
+        json: Option<PathBuf>,
+        /// Picture of three episodes.
         #[arg(long)]
         picture: Option<PathBuf>,
     },
@@ -100,77 +115,41 @@ fn main() -> anyhow::Result<()> {
             }
             trainer.run(&clips, None)?;
         }
-        Command::Eval { checkpoint, episodes, range, picture } => {
+        Command::Eval { checkpoint, episodes, range, json, picture } => {
             tch::set_num_threads(1);
-            evaluate(&checkpoint, &episodes, range, picture)?;
+            evaluate(&checkpoint, &episodes, range, json.as_deref(), picture.as_deref())?;
         }
     }
     Ok(())
 }
 
 fn evaluate(
-    checkpoint: &std::path::Path,
-    episodes: &std::path::Path,
+    checkpoint: &Path,
+    episodes: &Path,
     range: Option<Vec<usize>>,
-    picture: Option<PathBuf>,
+    json: Option<&Path>,
+    picture: Option<&Path>,
 ) -> anyhow::Result<()> {
-    use gatsbi_models::{gatsbi::world::GatsbiWorld, world_model::WorldModel as _};
-    use gatsbi_training::evaluation::{CONDITIONING, Recorded, decomposition, psnr, rollout, wanted};
     let world = GatsbiWorld::load(checkpoint, Device::Cpu)?;
     let dataset = Dataset::open(episodes)?;
     let range = range.map_or(0..dataset.len(), |range| range[0]..range[1]);
-    let indices: Vec<usize> = range.collect();
-    let neutral = world.spec().neutral_action();
-    let agent = world.spec().agent_slot.unwrap_or(0);
-    let mut iou = [Vec::new(), Vec::new()];
-    let mut bg = [Vec::new(), Vec::new()];
-    let mut counts = [decomposition::ObjectCounts::default(); 2];
-    let (mut gain, mut action_gain, mut observed_psnr, mut imagined_psnr) = (vec![], vec![], vec![], vec![]);
-    for (chunk_index, chunk) in indices.chunks(10).enumerate() {
-        let recorded = Recorded::read(&dataset, chunk, 20, &neutral, Device::Cpu)?;
+    let bar = ProgressBar::new(range.len() as u64);
+    let report = report(&world, &dataset, range.clone(), HORIZON, |done| bar.inc(done as u64))?;
+    bar.finish_and_clear();
+    println!("{} on {}", report.model["name"], report.data);
+    for (name, value) in report.numbers.iter().filter(|(name, _)| !name.ends_with("_ci95")) {
+        println!("{name:<28} {value:>9.4} ± {:.4}", report.numbers[&format!("{name}_ci95")]);
+    }
+    if let Some(path) = json {
+        fs_err::write(path, serde_json::to_string_pretty(&report)?)?;
+    }
+    if let Some(path) = picture {
+        let episodes: Vec<usize> = range.step_by(3).take(3).collect();
+        let neutral = world.spec().neutral_action();
+        let length = CONDITIONING + HORIZON;
+        let recorded = Recorded::read(&dataset, &episodes, length, &neutral, Device::Cpu)?;
         let scenes = rollout(&world, &recorded, &recorded.actions, wanted());
-        let mut other = Vec::new();
-        for (t, action) in recorded.actions.iter().enumerate() {
-            other.push(if t < CONDITIONING { action.shallow_clone() } else { action.roll([1i64].as_slice(), [0i64].as_slice()) });
-        }
-        let others = rollout(&world, &recorded, &other, wanted());
-        if let (Some(path), 0) = (&picture, chunk_index) {
-            gatsbi_training::evaluation::picture::write(path, &Recorded{frames: recorded.frames.iter().map(|f| f.narrow(0,0,3.min(f.size()[0]))).collect(), actions: vec![], labels: None}, &scenes, world.spec().agent_slot, 1)?;
-        }
-        let copy = &recorded.frames[CONDITIONING - 1];
-        for (t, scene) in scenes.iter().enumerate() {
-            let imagined = usize::from(t >= CONDITIONING);
-            let truth = &recorded.frames[t];
-            let own: Vec<f32> = psnr(scene.frame.as_ref().unwrap(), truth).try_into()?;
-            let copied: Vec<f32> = psnr(copy, truth).try_into()?;
-            let swapped: Vec<f32> = psnr(others[t].frame.as_ref().unwrap(), truth).try_into()?;
-            if imagined == 1 {
-                gain.extend(own.iter().zip(&copied).map(|(a, b)| a - b));
-                imagined_psnr.extend(own.iter().copied());
-                if t >= CONDITIONING + 4 {
-                    action_gain.extend(own.iter().zip(&swapped).map(|(a, b)| a - b));
-                }
-            } else {
-                observed_psnr.extend(own.iter().copied());
-            }
-            let labels = &recorded.labels.as_ref().unwrap()[t];
-            let seg = decomposition::segmentation(scene);
-            iou[imagined].extend(decomposition::iou(&seg.eq(agent), &labels.eq(1)));
-            let slots = world.spec().slots;
-            bg[imagined].extend(decomposition::iou(&seg.lt(slots).logical_and(&seg.ne(agent)), &labels.eq(0)));
-            for row in 0..chunk.len() as i64 {
-                let (c, _) = decomposition::match_objects(scene, labels, row);
-                let total = &mut counts[imagined];
-                total.truth += c.truth; total.found += c.found; total.matched += c.matched; total.distance += c.distance;
-            }
-        }
+        picture::write(path, &recorded, &scenes, world.spec().agent_slot, 1)?;
     }
-    let mean = |x: &[f64]| x.iter().filter(|v| v.is_finite()).sum::<f64>() / x.len() as f64;
-    let mean32 = |x: &[f32]| x.iter().map(|v| f64::from(*v)).sum::<f64>() / x.len() as f64;
-    println!("agent_iou observed {:.3} imagined {:.3}   background iou {:.3} {:.3}", mean(&iou[0]), mean(&iou[1]), mean(&bg[0]), mean(&bg[1]));
-    for (name, c) in ["observed", "imagined"].iter().zip(counts) {
-        println!("objects {name}: recall {:.3} precision {:.3} position {:.2} px", c.matched as f64 / c.truth as f64, c.matched as f64 / c.found.max(1) as f64, c.distance / c.matched.max(1) as f64);
-    }
-    println!("psnr observed {:.2} imagined {:.2}  gain over copy {:.2} dB  action gain {:.2} dB", mean32(&observed_psnr), mean32(&imagined_psnr), mean32(&gain), mean32(&action_gain));
     Ok(())
 }

@@ -57,7 +57,7 @@ impl Terms {
             let mean = value.mean(Kind::Float);
             terms.push((name, mean.detach()));
             if weight != 0.0 {
-                loss = loss + mean * weight;
+                loss += mean * weight;
             }
         }
         Objective { loss: loss.sum(Kind::Float), terms }

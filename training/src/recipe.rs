@@ -146,8 +146,7 @@ impl Ramp {
                     (Some((from, low)), Some(&(to, high))) => {
                         low + (high - low) * (step - from) as f64 / (to - from) as f64
                     }
-                    (Some((_, value)), None) => value,
-                    (None, Some(&(_, value))) => value,
+                    (Some((_, value)), None) | (None, Some(&(_, value))) => value,
                     (None, None) => 0.0,
                 }
             }

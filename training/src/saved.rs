@@ -34,10 +34,17 @@ pub struct Progress {
 }
 
 /// Writes weights, moments and progress.
-pub fn save(path: &Path, stores: &[&ParamStore], adam: &Adam, progress: &Progress) -> anyhow::Result<()> {
+pub fn save(
+    path: &Path,
+    stores: &[&ParamStore],
+    adam: &Adam,
+    progress: &Progress,
+) -> anyhow::Result<()> {
     let mut tensors: Vec<(String, Tensor)> = Vec::new();
     for store in stores {
-        tensors.extend(store.iter().map(|(name, _, tensor)| (format!("weight.{name}"), tensor.detach())));
+        tensors.extend(
+            store.iter().map(|(name, _, tensor)| (format!("weight.{name}"), tensor.detach())),
+        );
     }
     tensors.extend(adam.tensors());
     let encoded: Vec<(String, Dtype, Vec<usize>, Vec<u8>)> = tensors
@@ -68,7 +75,8 @@ pub fn load(path: &Path, stores: &[&ParamStore], adam: &mut Adam) -> anyhow::Res
     let header = metadata.metadata().as_ref().and_then(|header| header.get(HEADER_KEY));
     let progress: Progress = serde_json::from_str(header.with_context(broken)?)?;
     let read = |name: &str| -> anyhow::Result<Tensor> {
-        let view = tensors.tensor(name).with_context(|| format!("{} has no {name}", path.display()))?;
+        let view =
+            tensors.tensor(name).with_context(|| format!("{} has no {name}", path.display()))?;
         let kind = match view.dtype() {
             Dtype::F32 => Kind::Float,
             Dtype::I64 => Kind::Int64,
@@ -81,11 +89,17 @@ pub fn load(path: &Path, stores: &[&ParamStore], adam: &mut Adam) -> anyhow::Res
     for store in stores {
         for (name, _, parameter) in store.iter() {
             let saved = read(&format!("weight.{name}"))?;
-            ensure!(saved.size() == parameter.size(), "{name} has another shape in {}", path.display());
+            ensure!(
+                saved.size() == parameter.size(),
+                "{name} has another shape in {}",
+                path.display()
+            );
             parameter.shallow_clone().copy_(&saved);
         }
         let device = store.device();
-        adam.restore(store, device, |name| tensors.tensor(name).is_ok().then(|| read(name)).transpose())?;
+        adam.restore(store, device, |name| {
+            tensors.tensor(name).is_ok().then(|| read(name)).transpose()
+        })?;
     }
     Ok(progress)
 }

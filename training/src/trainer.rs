@@ -172,7 +172,10 @@ impl Trainer {
                 );
             }
             self.progress.seconds += started.elapsed().as_secs_f64();
-            let every = |steps: u64| steps > 0 && self.progress.step % steps == 0;
+            if self.progress.step == self.recipe.steps {
+                self.recalibrate(clips);
+            }
+            let every = |steps: u64| steps > 0 && self.progress.step.is_multiple_of(steps);
             if every(self.recipe.save_every) || self.progress.step == end {
                 self.save()?;
             }

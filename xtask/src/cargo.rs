@@ -25,7 +25,8 @@ pub(crate) fn lint(root: &Path) -> Result<()> {
     run(&mut cargo(root, "fmt --all --check"))?;
     setup::ensure_set_up(root)?;
     run(&mut cargo(root, "clippy --workspace --all-targets --locked -- -D warnings"))?;
-    run(cargo(root, "doc --workspace --no-deps --locked").env("RUSTDOCFLAGS", "-D warnings"))?;
+    run(cargo(root, "doc --workspace --no-deps --document-private-items --locked")
+        .env("RUSTDOCFLAGS", "-D warnings"))?;
     let deny =
         cargo(root, "deny --version").stdout(Stdio::null()).stderr(Stdio::null()).status()?;
     if deny.success() {

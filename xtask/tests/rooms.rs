@@ -35,7 +35,11 @@ const ROOMS: &[Room] = &[
         may_name: &[MODELS, "gatsbi-episodes", "gatsbi-proto"],
         must_not_hold: &[],
     },
-    Room { package: "gatsbi-client", may_name: &["gatsbi-proto"], must_not_hold: &[] },
+    Room {
+        package: "gatsbi-client",
+        may_name: &["gatsbi-episodes", "gatsbi-proto"],
+        must_not_hold: &[MODELS],
+    },
     Room { package: "gatsbi-sim", may_name: &["gatsbi-episodes"], must_not_hold: &[] },
     Room {
         package: "gatsbi-tests",

@@ -18,9 +18,42 @@ pub fn segmentation(scene: &Scene) -> Tensor {
 
 /// Intersection over union of two bool maps `[B, H, W]`, per row; NaN where both are empty.
 pub fn iou(a: &Tensor, b: &Tensor) -> Vec<f64> {
-    let count = |x: Tensor| x.to_kind(Kind::Float).sum_dim_intlist([1i64, 2].as_slice(), false, Kind::Float);
+    let count = |x: Tensor| {
+        x.to_kind(Kind::Float).sum_dim_intlist([1i64, 2].as_slice(), false, Kind::Float)
+    };
     let ratio = count(a.logical_and(b)) / count(a.logical_or(b));
     ratio.to_kind(Kind::Double).try_into().expect("one number per row")
+}
+
+/// The segmentation of row `row` with all background slots as one, `[H, W]` int64.
+pub fn entities(segmentation: &Tensor, is_background: &Tensor, row: i64) -> Tensor {
+    segmentation.get(row).masked_fill(&is_background.get(row), -1)
+}
+
+/// Adjusted Rand index of two segmentations `[H, W]` (Hubert & Arabie 1985): 1 for equal partitions, 0 for
+/// what chance gives, NaN if nothing else is possible.
+pub fn adjusted_rand_index(a: &Tensor, b: &Tensor) -> f64 {
+    let classes = |x: &Tensor| -> Vec<i64> {
+        x.flatten(0, -1).unique_dim(0, true, false, false).0.try_into().expect("integers")
+    };
+    let pairs = |n: f64| n * (n - 1.0) / 2.0;
+    let count = |x: &Tensor| x.sum(Kind::Int64).int64_value(&[]) as f64;
+    let (mut together, mut in_a, mut in_b) = (0.0, 0.0, 0.0);
+    let classes_b = classes(b);
+    for class_a in classes(a) {
+        let mask = a.eq(class_a);
+        in_a += pairs(count(&mask));
+        for class_b in &classes_b {
+            together += pairs(count(&mask.logical_and(&b.eq(*class_b))));
+        }
+    }
+    for class_b in &classes_b {
+        in_b += pairs(count(&b.eq(*class_b)));
+    }
+    let expected = in_a * in_b / pairs(a.numel() as f64);
+    let most = f64::midpoint(in_a, in_b);
+    // NaN where both partitions have one part, or only parts of one pixel: chance cannot do worse.
+    (together - expected) / (most - expected)
 }
 
 /// Objects found in a frame against the true ones.
@@ -87,4 +120,29 @@ pub fn match_objects(scene: &Scene, labels: &Tensor, row: i64) -> (ObjectCounts,
         }
     }
     (counts, matches)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rand_index_knows_equal_and_independent_partitions() {
+        let a = Tensor::from_slice(&[0i64, 0, 1, 1, 2, 2]).view([2, 3]);
+        let renamed = Tensor::from_slice(&[5i64, 5, 3, 3, 9, 9]).view([2, 3]);
+        assert!((adjusted_rand_index(&a, &renamed) - 1.0).abs() < 1e-12);
+        let rows = Tensor::from_slice(&[0i64, 0, 1, 1]).view([2, 2]);
+        let columns = Tensor::from_slice(&[0i64, 1, 0, 1]).view([2, 2]);
+        assert!((adjusted_rand_index(&rows, &columns) + 0.5).abs() < 1e-12);
+    }
+
+    #[test]
+    fn empty_and_full_overlap() {
+        let a = Tensor::from_slice(&[true, true, false, false]).view([1, 2, 2]);
+        let b = Tensor::from_slice(&[true, false, false, false]).view([1, 2, 2]);
+        assert!((iou(&a, &b)[0] - 0.5).abs() < 1e-12);
+        assert!(
+            iou(&a.logical_and(&a.logical_not()), &b.logical_and(&b.logical_not()))[0].is_nan()
+        );
+    }
 }

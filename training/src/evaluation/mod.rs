@@ -1,7 +1,10 @@
 //! Evaluation: five frames observed, then imagination, against the recorded future and its ground truth.
 
 pub mod decomposition;
+pub mod images;
 pub mod picture;
+pub mod report;
+pub mod statistics;
 
 use anyhow::Context as _;
 use gatsbi_episodes::{Dataset, Episode};
@@ -100,10 +103,4 @@ pub fn wanted() -> Outputs {
         Output::Objects,
         Output::Background,
     ])
-}
-
-/// Peak signal-to-noise ratio in dB of images in [0, 1], `[B]`.
-pub fn psnr(image: &Tensor, truth: &Tensor) -> Tensor {
-    let error = (image.clamp(0.0, 1.0) - truth).square().mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
-    error.clamp_min(1e-10).log10() * -10.0
 }

@@ -34,10 +34,7 @@ impl KeypointDecoder {
         Self {
             appearance: Trunk::new(&path.sub("appearance"), 3, config),
             input: he_uniform(&path.sub("input"), input),
-            scales: [
-                scale("middle", widest, 2 * filters),
-                scale("fine", 2 * filters, filters),
-            ],
+            scales: [scale("middle", widest, 2 * filters), scale("fine", 2 * filters, filters)],
             output: he_uniform(&path.sub("output"), ConvShape::same(filters, 3, 1)),
         }
     }

@@ -107,10 +107,11 @@ fn separation(points: &Tensor) -> Tensor {
     let place = points.narrow(-1, 0, 2); // [B, T, N, 2]
     let centred = &place - place.mean_dim([1i64].as_slice(), true, Kind::Float);
     let difference = centred.unsqueeze(2) - centred.unsqueeze(3); // [B, T, N, N, 2]
-    let distance = difference
-        .square()
-        .sum_dim_intlist(-1, false, Kind::Float)
-        .mean_dim([1i64].as_slice(), false, Kind::Float); // [B, N, N]
+    let distance = difference.square().sum_dim_intlist(-1, false, Kind::Float).mean_dim(
+        [1i64].as_slice(),
+        false,
+        Kind::Float,
+    ); // [B, N, N]
     let near = (distance * (-0.5 / (SEPARATION_WIDTH * SEPARATION_WIDTH))).exp();
     let itself = near.size()[1] as f64;
     near.sum_dim_intlist([1i64, 2].as_slice(), false, Kind::Float).mean(Kind::Float) - itself
@@ -164,11 +165,8 @@ mod tests {
         });
         let keypoints: Vec<_> = frames.iter().map(|frame| detector.forward(frame)).collect();
         let losses = learning.losses(&frames, &keypoints, &actions, &noise);
-        let total = losses.image
-            + losses.separation * 0.02
-            + losses.sparsity
-            + losses.dynamics
-            + losses.kl;
+        let total =
+            losses.image + losses.separation * 0.02 + losses.sparsity + losses.dynamics + losses.kl;
         total.backward();
         for (name, parameter) in store.trainable() {
             let gradient = parameter.grad();

@@ -73,8 +73,10 @@ impl Relations {
                 let neighbours = match metric {
                     KnnMetric::Distance => nearest(z, rows, k),
                     KnnMetric::Weight => {
-                        let (_, by_weight) =
-                            self.presence_weights(&terms, z, rows).sort_stable(true, -1, true);
+                        let weights = self.presence_weights(&terms, z, rows);
+                        // Below every weight, that of an absent object too: nobody is his own neighbour.
+                        let others = weights.masked_fill(&itself(z, rows), -1.0);
+                        let (_, by_weight) = others.sort_stable(true, -1, true);
                         by_weight.narrow(-1, 0, k)
                     }
                 };
@@ -95,8 +97,7 @@ impl Relations {
     fn presence_weights(&self, terms: &PairTerms, z: &Tensor, rows: &Tensor) -> Tensor {
         let logits = self.weight.tail(&pairs(&terms.weight)).squeeze_dim(-1);
         let weights = logits.softmax(-1, Kind::Float) * presence(z).transpose(1, 2);
-        let columns = Tensor::arange(z.size()[1], (Kind::Int64, z.device()));
-        weights.masked_fill(&rows.unsqueeze(-1).eq_tensor(&columns), 0.0)
+        weights.masked_fill(&itself(z, rows), 0.0)
     }
 
     /// Effects of the given neighbours, `[B, R, k]`, on each receiver.
@@ -147,17 +148,24 @@ pub(super) fn gather_rows(x: &Tensor, rows: &Tensor) -> Tensor {
 
 /// The k nearest others of each receiver by centre distance, absent ones last, ties by index, `[B, R, k]`.
 fn nearest(z: &Tensor, rows: &Tensor, k: i64) -> Tensor {
-    // Farther than any two centres ever are, and absent others farther still.
-    const ABSENT: f64 = 1e6;
-    const ITSELF: f64 = 1e12;
     let _no_grad = tch::no_grad_guard();
     let centres = shift(z);
     let difference = gather_rows(&centres, rows).unsqueeze(2) - centres.unsqueeze(1);
     let distance = difference.square().sum_dim_intlist(-1, false, Kind::Float); // [B, R, N]
-    let absent = presence(z).lt(0.5).transpose(1, 2).to_kind(Kind::Float) * ABSENT;
+    let itself = itself(z, rows);
+    let (_, by_distance) =
+        distance.masked_fill(&itself, f64::INFINITY).sort_stable(true, -1, false);
+    // The receiver is the farthest of all; counted as absent it stays so.
+    let absent = presence(z).lt(0.5).transpose(1, 2).logical_or(&itself);
+    let absent = absent.gather(-1, &by_distance, false).to_kind(Kind::Int64);
+    let (_, present_first) = absent.sort_stable(true, -1, false);
+    by_distance.gather(-1, &present_first, false).narrow(-1, 0, k)
+}
+
+/// Where the sender is the receiver itself, `[B, R, N]` bool.
+fn itself(z: &Tensor, rows: &Tensor) -> Tensor {
     let columns = Tensor::arange(z.size()[1], (Kind::Int64, z.device()));
-    let distance = (distance + absent).masked_fill(&rows.unsqueeze(-1).eq_tensor(&columns), ITSELF);
-    distance.sort_stable(true, -1, false).1.narrow(-1, 0, k)
+    rows.unsqueeze(-1).eq_tensor(&columns)
 }
 
 /// An MLP over ordered pairs whose first layer is split by receiver and sender.

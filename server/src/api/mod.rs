@@ -1,0 +1,9 @@
+//! The two skins over [`crate::service`]: gRPC and REST. Neither decides anything.
+
+pub mod admin;
+mod counted;
+mod form;
+pub mod grpc;
+pub mod json;
+pub mod problem;
+pub mod rest;

@@ -1,0 +1,287 @@
+//! What an operator can set: flags and environment, their defaults, and what is wrong with them.
+
+use std::{net::SocketAddr, path::PathBuf, str::FromStr, time::Duration};
+
+use clap::Parser;
+
+use crate::engine::{DoorSizes, EngineConfig, scheduler::Sizes};
+
+/// Serves GATSBI world models to robot agents over gRPC and REST.
+#[derive(Clone, Debug, Parser)]
+#[command(version)]
+pub struct Config {
+    /// Checkpoint to serve, as PATH or NAME=PATH; may be given several times. A card beside it (the same name with
+    /// the extension .md) is served with it.
+    #[arg(long = "checkpoint", env = "GATSBI_CHECKPOINTS", value_delimiter = ',')]
+    pub checkpoints: Vec<CheckpointArg>,
+
+    /// Where models compute: cpu, or cuda:N.
+    #[arg(long, env = "GATSBI_DEVICE", default_value = "cpu")]
+    pub device: DeviceArg,
+
+    /// Address of the gRPC API.
+    #[arg(long, env = "GATSBI_GRPC_LISTEN", default_value = "127.0.0.1:50051")]
+    pub grpc_listen: SocketAddr,
+
+    /// Address of the REST API.
+    #[arg(long, env = "GATSBI_HTTP_LISTEN", default_value = "127.0.0.1:8080")]
+    pub http_listen: SocketAddr,
+
+    /// Address of administration: health, metrics, models. Whoever reaches it may use it.
+    #[arg(long, env = "GATSBI_ADMIN_LISTEN", default_value = "127.0.0.1:9090")]
+    pub admin_listen: SocketAddr,
+
+    /// Allows addresses other than the loopback. There are no keys yet: whoever reaches them may use them.
+    #[arg(long, env = "GATSBI_ALLOW_PUBLIC")]
+    pub allow_public: bool,
+
+    /// CPU threads of one operation. More than there are idle cores makes every step slower; 0 takes half of the
+    /// cores.
+    #[arg(long, env = "GATSBI_THREADS", default_value_t = 0)]
+    pub threads: usize,
+
+    /// Rows of an observe block. 1 answers a lone robot fastest; a GPU wants 16 or so. Changing it changes answers
+    /// in their last bits.
+    #[arg(long, env = "GATSBI_OBSERVE_BLOCK", default_value_t = 1)]
+    pub observe_block: usize,
+
+    /// Rows of an imagine block; rollouts of fewer rows are padded. Changing it changes answers in their last bits.
+    #[arg(long, env = "GATSBI_IMAGINE_BLOCK", default_value_t = 8)]
+    pub imagine_block: usize,
+
+    /// How long rollouts may keep an observation waiting, in milliseconds; one block is always computed.
+    #[arg(long, env = "GATSBI_TICK_MILLIS", default_value_t = 20)]
+    pub tick_millis: u64,
+
+    /// Rows of rollouts that are on their way at once, at least one block.
+    #[arg(long, env = "GATSBI_ARENA_ROWS", default_value_t = 512)]
+    pub arena_rows: usize,
+
+    /// Observations that may wait for the model; more are refused.
+    #[arg(long, env = "GATSBI_MAX_OBSERVES", default_value_t = 256)]
+    pub max_observes: usize,
+
+    /// Rows (candidates times samples) of all rollouts that may wait; more are refused.
+    #[arg(long, env = "GATSBI_MAX_ROWS", default_value_t = 16_384)]
+    pub max_rows: usize,
+
+    /// Outputs of all rollouts that may wait to be fetched, in MiB; more are refused.
+    #[arg(long, env = "GATSBI_MAX_OUTPUT_MIB", default_value_t = 1024)]
+    pub max_output_mib: u64,
+
+    /// Rows of one rollout.
+    #[arg(long, env = "GATSBI_MAX_REQUEST_ROWS", default_value_t = 4096)]
+    pub max_request_rows: u32,
+
+    /// Outputs of one rollout, in MiB.
+    #[arg(long, env = "GATSBI_MAX_REQUEST_OUTPUT_MIB", default_value_t = 256)]
+    pub max_request_output_mib: u64,
+
+    /// Candidates of one rollout.
+    #[arg(long, env = "GATSBI_MAX_CANDIDATES", default_value_t = 4096)]
+    pub max_candidates: u32,
+
+    /// Steps of one rollout.
+    #[arg(long, env = "GATSBI_MAX_HORIZON", default_value_t = 256)]
+    pub max_horizon: u32,
+
+    /// Samples of one rollout.
+    #[arg(long, env = "GATSBI_MAX_SAMPLES", default_value_t = 256)]
+    pub max_samples: u32,
+
+    /// Width and height of an image that is sent, in pixels.
+    #[arg(long, env = "GATSBI_MAX_IMAGE_SIDE", default_value_t = 4096)]
+    pub max_image_side: u32,
+
+    /// Size of a request, in MiB.
+    #[arg(long, env = "GATSBI_MAX_REQUEST_MIB", default_value_t = 16)]
+    pub max_request_mib: usize,
+
+    /// Sessions that are kept; more are refused.
+    #[arg(long, env = "GATSBI_MAX_SESSIONS", default_value_t = 10_000)]
+    pub max_sessions: usize,
+
+    /// How long a session may lie unused, in seconds.
+    #[arg(long, env = "GATSBI_SESSION_TTL_SECONDS", default_value_t = 3600)]
+    pub session_ttl_seconds: u64,
+
+    /// How long requests may take to finish after SIGINT or SIGTERM, in seconds.
+    #[arg(long, env = "GATSBI_DRAIN_SECONDS", default_value_t = 10)]
+    pub drain_seconds: u64,
+
+    /// What is logged, such as info or gatsbi_server=debug.
+    #[arg(long, env = "GATSBI_LOG", default_value = "info")]
+    pub log: String,
+}
+
+/// A checkpoint with the name to serve it under.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct CheckpointArg {
+    /// The name; the checkpoint's own if absent.
+    pub name: Option<String>,
+    /// The file.
+    pub path: PathBuf,
+}
+
+impl FromStr for CheckpointArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (name, path) = match text.split_once('=') {
+            Some((name, path)) => (Some(name.to_owned()), path),
+            None => (None, text),
+        };
+        if path.is_empty() || name.as_ref().is_some_and(String::is_empty) {
+            return Err("expected PATH or NAME=PATH".to_owned());
+        }
+        Ok(Self { name, path: path.into() })
+    }
+}
+
+/// A device.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct DeviceArg(pub tch::Device);
+
+impl FromStr for DeviceArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let cuda = text.strip_prefix("cuda:").map(str::parse::<usize>);
+        match (text, cuda) {
+            ("cpu", _) => Ok(Self(tch::Device::Cpu)),
+            ("cuda", _) => Ok(Self(tch::Device::Cuda(0))),
+            (_, Some(Ok(index))) => Ok(Self(tch::Device::Cuda(index))),
+            _ => Err("expected cpu or cuda:N".to_owned()),
+        }
+    }
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        // Flags alone, so that the environment of a test does not matter.
+        let command =
+            <Self as clap::CommandFactory>::command().mut_args(|arg| arg.env(None::<&str>));
+        let matches = command.get_matches_from(["gatsbi-server"]);
+        <Self as clap::FromArgMatches>::from_arg_matches(&matches)
+            .expect("every flag has a default")
+    }
+}
+
+impl Config {
+    /// Everything that is wrong, in words; nothing if it can be used.
+    pub fn problems(&self) -> Vec<String> {
+        let mut problems = Vec::new();
+        let mut check = |holds: bool, problem: String| {
+            if !holds {
+                problems.push(problem);
+            }
+        };
+        check(!self.checkpoints.is_empty(), "no --checkpoint is given".to_owned());
+        for (flag, address) in [
+            ("--grpc-listen", self.grpc_listen),
+            ("--http-listen", self.http_listen),
+            ("--admin-listen", self.admin_listen),
+        ] {
+            check(
+                self.allow_public || address.ip().is_loopback(),
+                format!(
+                    "{flag} {address} can be reached from other machines; --allow-public says that this is meant"
+                ),
+            );
+        }
+        for (flag, value, range) in [
+            ("--threads", self.threads, 0..=1024),
+            ("--observe-block", self.observe_block, 1..=1024),
+            ("--imagine-block", self.imagine_block, 1..=1024),
+            ("--arena-rows", self.arena_rows, self.imagine_block..=1 << 20),
+            ("--max-observes", self.max_observes, 1..=1 << 20),
+            ("--max-rows", self.max_rows, self.max_request_rows as usize..=1 << 24),
+            ("--max-request-rows", self.max_request_rows as usize, 1..=1 << 20),
+            ("--max-candidates", self.max_candidates as usize, 1..=1 << 16),
+            ("--max-horizon", self.max_horizon as usize, 1..=1 << 16),
+            ("--max-samples", self.max_samples as usize, 1..=1 << 16),
+            ("--max-image-side", self.max_image_side as usize, 1..=1 << 14),
+            ("--max-request-mib", self.max_request_mib, 1..=1 << 10),
+            ("--max-output-mib", self.max_output_mib as usize, 1..=1 << 20),
+            (
+                "--max-request-output-mib",
+                self.max_request_output_mib as usize,
+                1..=self.max_output_mib as usize,
+            ),
+            ("--max-sessions", self.max_sessions, 1..=1 << 24),
+            ("--session-ttl-seconds", self.session_ttl_seconds as usize, 1..=1 << 30),
+        ] {
+            check(
+                range.contains(&value),
+                format!("{flag} is {value}, expected {} to {}", range.start(), range.end()),
+            );
+        }
+        if let tch::Device::Cuda(index) = self.device.0 {
+            let found = tch::Cuda::device_count();
+            check(
+                (index as i64) < found,
+                format!("--device is cuda:{index}, but libtorch sees {found} CUDA devices"),
+            );
+        }
+        problems
+    }
+
+    /// Sizes of the engine.
+    pub fn engine(&self) -> EngineConfig {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        EngineConfig {
+            threads: if self.threads == 0 { (cores / 2).max(1) } else { self.threads },
+            sizes: Sizes {
+                observe_block: self.observe_block,
+                imagine_block: self.imagine_block,
+                slots: self.arena_rows,
+            },
+            tick: Duration::from_millis(self.tick_millis),
+            door: DoorSizes {
+                observes: self.max_observes,
+                rows: self.max_rows,
+                output_bytes: self.max_output_mib << 20,
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_lack_nothing_but_a_checkpoint() {
+        assert_eq!(Config::default().problems(), ["no --checkpoint is given"]);
+    }
+
+    #[test]
+    fn all_problems_are_told_at_once() {
+        let config = Config {
+            checkpoints: vec!["tiny=models/tiny.safetensors".parse().unwrap()],
+            http_listen: "0.0.0.0:80".parse().unwrap(),
+            imagine_block: 0,
+            max_rows: 1,
+            ..Config::default()
+        };
+        let problems = config.problems();
+        assert_eq!(problems.len(), 3, "{problems:?}");
+        assert!(problems[0].starts_with("--http-listen 0.0.0.0:80"));
+        assert_eq!(problems[1], "--imagine-block is 0, expected 1 to 1024");
+        assert_eq!(problems[2], "--max-rows is 1, expected 4096 to 16777216");
+        let public = Config { allow_public: true, imagine_block: 1, max_rows: 4096, ..config };
+        assert_eq!(public.problems(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn checkpoints_may_be_named() {
+        let parse = |text: &str| text.parse::<CheckpointArg>();
+        assert_eq!(parse("a/b.safetensors").unwrap().name, None);
+        let named = parse("tiny=a/b.safetensors").unwrap();
+        assert_eq!(named.name.as_deref(), Some("tiny"));
+        assert_eq!(named.path, PathBuf::from("a/b.safetensors"));
+        assert!(parse("tiny=").is_err() && parse("=x").is_err());
+        assert!("cuda:x".parse::<DeviceArg>().is_err());
+        assert_eq!("cuda:1".parse::<DeviceArg>().unwrap().0, tch::Device::Cuda(1));
+    }
+}

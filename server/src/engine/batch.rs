@@ -1,0 +1,244 @@
+//! One batch through the model: rows to tensors, the step, and outputs to bytes on the host.
+//!
+//! Everything that touches tensors and may panic is behind [`compute`].
+
+use std::{
+    ops::Range,
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bytes::Bytes;
+use gatsbi_models::{
+    noise::{PhiloxNoise, RowNoise},
+    scene::{Output, Outputs, Scene},
+    state::{State, StateRow},
+    world_model::WorldModel,
+};
+use tch::{Device, Kind, Tensor};
+
+use super::{
+    arena::Arena,
+    commands::{Form, Imagine, NumberType, Observe, Spent, Value, Wanted},
+    scheduler::RowStep,
+};
+
+/// The rows of a block as a model takes them. Empty lanes hold copies of a taken one.
+pub(super) struct Batch {
+    states: States,
+    frames: Option<Vec<Arc<[f32]>>>,
+    actions: Vec<f32>,
+    noise: Vec<RowNoise>,
+    wanted: Vec<Wanted>,
+    rows: usize,
+    imagine: bool,
+}
+
+enum States {
+    Host(Vec<Arc<StateRow>>),
+    Device(State),
+}
+
+/// What came of a batch, lane by lane.
+pub(super) struct Computed {
+    /// The new states on the host, if they are wanted there.
+    pub(super) rows: Option<Vec<StateRow>>,
+    /// Whether all numbers of a lane are finite.
+    pub(super) finite: Vec<bool>,
+    state: State,
+    values: Vec<(Form, Value)>,
+    compute: Duration,
+    encode: Duration,
+}
+
+impl Batch {
+    /// A batch of observes, all with an image or all without.
+    pub(super) fn observe(lanes: &[Option<&Observe>]) -> Self {
+        let padded = padded(lanes);
+        let frames: Option<Vec<Arc<[f32]>>> =
+            padded.iter().map(|observe| observe.frame.clone()).collect();
+        Self {
+            states: States::Host(padded.iter().map(|observe| Arc::clone(&observe.state)).collect()),
+            frames,
+            actions: padded.iter().flat_map(|observe| &observe.action).copied().collect(),
+            noise: padded.iter().map(|observe| observe.noise).collect(),
+            wanted: lanes.iter().flatten().map(|observe| observe.wanted).collect(),
+            rows: lanes.iter().flatten().count(),
+            imagine: false,
+        }
+    }
+
+    /// A batch of steps of rollouts, whose states lie in the arena.
+    pub(super) fn imagine(lanes: &[Option<(&Imagine, RowStep)>], arena: &Arena) -> Self {
+        let padded = padded(lanes);
+        let slots: Vec<u32> = padded.iter().map(|(_, step)| step.slot).collect();
+        let actions = padded.iter().flat_map(|(job, step)| job.action(step.row, step.depth));
+        let wanted = lanes.iter().flatten().filter(|(job, step)| job.wants(step.depth));
+        Self {
+            states: States::Device(arena.take(&slots)),
+            frames: None,
+            actions: actions.copied().collect(),
+            noise: padded.iter().map(|(job, step)| job.noise(step.row, step.depth)).collect(),
+            wanted: wanted.map(|(job, _)| job.wanted).collect(),
+            rows: lanes.iter().flatten().count(),
+            imagine: true,
+        }
+    }
+
+    /// Rows that are not padding.
+    pub(super) fn rows(&self) -> usize {
+        self.rows
+    }
+}
+
+impl Computed {
+    /// States of some lanes.
+    pub(super) fn gather(&self, lanes: &[i64]) -> State {
+        self.state.gather(&Tensor::from_slice(lanes).to_device(self.state.floats.device()))
+    }
+
+    /// What is wanted of neighbouring lanes.
+    pub(super) fn values(&self, lanes: Range<usize>, wanted: Wanted) -> Vec<Value> {
+        self.wanted(wanted)
+            .map(|value| {
+                let row = value.data.len() / self.finite.len();
+                let data = value.data.slice(lanes.start * row..lanes.end * row);
+                Value { data, shape: value.shape.clone(), ..*value }
+            })
+            .collect()
+    }
+
+    /// What is wanted of one lane, in memory of its own: sessions keep it, and should not keep the batch.
+    pub(super) fn row_values(&self, lane: usize, wanted: Wanted) -> Vec<Value> {
+        let mut values = self.values(lane..lane + 1, wanted);
+        for value in &mut values {
+            value.data = Bytes::copy_from_slice(&value.data);
+        }
+        values
+    }
+
+    /// Bytes of what is wanted of one lane.
+    pub(super) fn row_bytes(&self, wanted: Wanted) -> usize {
+        self.wanted(wanted).map(|value| value.data.len() / self.finite.len()).sum()
+    }
+
+    /// Where the time of a request went that waited before.
+    pub(super) fn spent(&self, queue: Duration) -> Spent {
+        Spent { queue, compute: self.compute, encode: self.encode }
+    }
+
+    fn wanted(&self, wanted: Wanted) -> impl Iterator<Item = &Value> {
+        let values = self.values.iter().filter(move |(form, value)| {
+            *form == wanted.form && wanted.outputs.contains(value.output)
+        });
+        values.map(|(_, value)| value)
+    }
+}
+
+/// Runs a batch through the model; a panic in there comes back as its message.
+pub(super) fn compute(world: &dyn WorldModel, batch: Batch) -> Result<Computed, String> {
+    catch_unwind(AssertUnwindSafe(|| step(world, batch))).map_err(|panic| {
+        let text = panic.downcast_ref::<String>().map(String::as_str);
+        text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()
+    })
+}
+
+fn step(world: &dyn WorldModel, batch: Batch) -> Computed {
+    let _no_grad = tch::no_grad_guard();
+    let started = Instant::now();
+    let device = world.device();
+    let lanes = batch.noise.len();
+    let outputs = batch.wanted.iter().fold(Outputs::default(), |all, one| all.union(one.outputs));
+    let host = matches!(batch.states, States::Host(_));
+    let state = match batch.states {
+        States::Host(rows) => State::from_rows(rows.iter().map(AsRef::as_ref), device),
+        States::Device(state) => state,
+    };
+    let tensor = |numbers: &[f32]| Tensor::from_slice(numbers).to_device(device);
+    let action = tensor(&batch.actions).view([lanes as i64, world.spec().actions.len() as i64]);
+    let noise = PhiloxNoise::new(batch.noise, device);
+    let (state, scene) = if batch.imagine {
+        world.imagine(&state, &action, &noise, outputs)
+    } else {
+        let frame = batch.frames.map(|frames| {
+            let size = world.spec().image_size;
+            tensor(&frames.concat()).view([lanes as i64, 3, size, size])
+        });
+        world.observe(&state, frame.as_ref(), &action, &noise, outputs)
+    };
+    let mut finite = finite(&state.floats);
+    for (_, tensor) in scene.tensors() {
+        finite = finite.logical_and(&self::finite(tensor));
+    }
+    // Reading the result waits for the device, so it is here that the step has ended.
+    let finite: Vec<bool> = finite.try_into().expect("one truth value per lane");
+    let rows = host.then(|| state.to_rows());
+    let compute = started.elapsed();
+    let started = Instant::now();
+    let values = values(&scene, &batch.wanted);
+    Computed { rows, finite, state, values, compute, encode: started.elapsed() }
+}
+
+/// Brings every output to the host once in each form in which it is wanted.
+fn values(scene: &Scene, wanted: &[Wanted]) -> Vec<(Form, Value)> {
+    let mut values = Vec::new();
+    for form in [Form::F32, Form::F16, Form::U8] {
+        let of_form = wanted.iter().filter(|wanted| wanted.form == form);
+        let outputs = of_form.fold(Outputs::default(), |all, one| all.union(one.outputs));
+        for (output, tensor) in scene.tensors().filter(|(output, _)| outputs.contains(*output)) {
+            values.push((form, value(output, tensor, numbers(output, form))));
+        }
+        if let (Some(objects), true) = (&scene.objects, outputs.contains(Output::Objects)) {
+            values.push((form, value(Output::Objects, &objects.ids, NumberType::I64)));
+        }
+    }
+    values
+}
+
+/// In which type an output is given.
+fn numbers(output: Output, form: Form) -> NumberType {
+    let picture = match output {
+        Output::Frame
+        | Output::AgentMask
+        | Output::SlotMasks
+        | Output::ObjectMasks
+        | Output::Background => true,
+        Output::Latents | Output::Keypoints => false,
+        Output::Objects | Output::Surprise | Output::LogLikelihood => return NumberType::F32,
+    };
+    match form {
+        Form::U8 if picture => NumberType::U8,
+        Form::F16 => NumberType::F16,
+        Form::F32 | Form::U8 => NumberType::F32,
+    }
+}
+
+fn value(output: Output, tensor: &Tensor, numbers: NumberType) -> Value {
+    let tensor = match output {
+        Output::Frame | Output::Background => tensor.permute([0, 2, 3, 1]),
+        _ => tensor.shallow_clone(),
+    };
+    let tensor = match numbers {
+        NumberType::U8 => (tensor.clamp(0.0, 1.0) * 255.0).round().to_kind(Kind::Uint8),
+        NumberType::F16 => tensor.to_kind(Kind::Half),
+        NumberType::F32 => tensor.to_kind(Kind::Float),
+        NumberType::I64 => tensor.to_kind(Kind::Int64),
+    };
+    let tensor = tensor.to_device(Device::Cpu).contiguous();
+    let shape = tensor.size()[1..].iter().map(|size| *size as usize).collect();
+    let mut data = vec![0; tensor.numel() * tensor.kind().elt_size_in_bytes()];
+    tensor.copy_data_u8(&mut data, tensor.numel());
+    Value { output, numbers, shape, data: Bytes::from(data) }
+}
+
+/// Whether all numbers of each row are finite, `[B]`.
+fn finite(tensor: &Tensor) -> Tensor {
+    tensor.isfinite().reshape([tensor.size()[0], -1]).all_dim(1, false)
+}
+
+/// All lanes, empty ones filled with the first taken one.
+fn padded<T: Copy>(lanes: &[Option<T>]) -> Vec<T> {
+    let first = lanes.iter().flatten().next().expect("a block has at least one row");
+    lanes.iter().map(|lane| lane.unwrap_or(*first)).collect()
+}

@@ -1,0 +1,218 @@
+//! Why a request fails: one enumeration for all use cases, known to neither gRPC nor HTTP.
+//!
+//! How each failure looks on the wire is decided in one place, [`crate::api::problem`].
+
+use std::{fmt, time::Duration};
+
+/// What is wrong with one field of a request.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct FieldProblem {
+    /// Path of the field, such as `observation.action[2]`.
+    pub field: String,
+    /// What was found.
+    pub value: String,
+    /// What was expected.
+    pub expected: String,
+}
+
+impl FieldProblem {
+    /// A problem with `field`, where `value` was found and `expected` should be.
+    pub fn new(
+        field: impl Into<String>,
+        value: impl fmt::Display,
+        expected: impl Into<String>,
+    ) -> Self {
+        Self { field: field.into(), value: value.to_string(), expected: expected.into() }
+    }
+}
+
+impl fmt::Display for FieldProblem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} is {}, expected {}", self.field, self.value, self.expected)
+    }
+}
+
+/// Why a request fails.
+#[derive(Clone, Debug, Eq, PartialEq, thiserror::Error)]
+pub enum Error {
+    /// Fields that are wrong whatever the state of the server.
+    #[error("{}", list(.0))]
+    InvalidFields(Vec<FieldProblem>),
+    /// A body that cannot be read as the message it should be.
+    #[error("the request body is not a valid {message}: {reason}")]
+    Malformed {
+        /// Name of the message.
+        message: String,
+        /// What the parser says.
+        reason: String,
+    },
+    /// A body of a type that is not understood.
+    #[error("content type {found} is not understood, expected {expected}")]
+    MediaType {
+        /// The type.
+        found: String,
+        /// Those that are.
+        expected: &'static str,
+    },
+    /// A body that is too large.
+    #[error("the request body has more than {limit_bytes} bytes")]
+    TooLarge {
+        /// The limit.
+        limit_bytes: usize,
+    },
+    /// A session that does not exist, or no longer.
+    #[error("there is no session {id}")]
+    UnknownSession {
+        /// The id that was given.
+        id: String,
+    },
+    /// A model that is not served.
+    #[error("there is no model {name}, but {}", served.join(", "))]
+    UnknownModel {
+        /// The name that was given.
+        name: String,
+        /// Those that are served.
+        served: Vec<String>,
+    },
+    /// A path that leads nowhere.
+    #[error("there is nothing at {path}")]
+    UnknownPath {
+        /// The path.
+        path: String,
+    },
+    /// A method that the path does not have.
+    #[error("{path} does not understand {method}")]
+    UnknownMethod {
+        /// The path.
+        path: String,
+        /// The method.
+        method: String,
+    },
+    /// A step that was observed before, with something else.
+    #[error("step {step} was already observed, with another observation or selection of outputs")]
+    StepConflict {
+        /// The step.
+        step: u64,
+    },
+    /// A step that is not the next one.
+    #[error("step {step} does not follow, the session expects step {expected}")]
+    StepGap {
+        /// The step that was given.
+        step: u64,
+        /// The session's next one.
+        expected: u64,
+    },
+    /// The session is not where the request believes it to be.
+    #[error("the session is at step {last}, not at {at_step}")]
+    SessionMoved {
+        /// The step that was given.
+        at_step: u64,
+        /// The last step observed.
+        last: u64,
+    },
+    /// A session without a belief.
+    #[error("the session has observed nothing yet")]
+    NothingObserved,
+    /// An output that exists for no step of this kind or on no such model.
+    #[error("{output} cannot be had: {reason}")]
+    OutputUnavailable {
+        /// Path of the field.
+        field: String,
+        /// The output.
+        output: &'static str,
+        /// Why.
+        reason: &'static str,
+    },
+    /// More work than the server takes on.
+    #[error("the server has as much work as it takes on: {what}")]
+    Overloaded {
+        /// Of what there is too much.
+        what: &'static str,
+        /// When it should have become less.
+        retry_after: Duration,
+    },
+    /// More sessions than the server keeps.
+    #[error("the server keeps no more than {limit} sessions")]
+    TooManySessions {
+        /// The limit.
+        limit: usize,
+        /// When the next one expires.
+        retry_after: Duration,
+    },
+    /// The answer would come too late.
+    #[error("the deadline passed before the answer was there")]
+    DeadlineExceeded,
+    /// Part of the API that this version does not have.
+    #[error("{what} is not available in this version")]
+    Unimplemented {
+        /// What.
+        what: &'static str,
+    },
+    /// The model panicked.
+    #[error("the model failed on this request")]
+    ModelFailed,
+    /// The model computed something that is not a number.
+    #[error("the model computed numbers that are not finite for this request")]
+    NotFinite,
+    /// The server is going down.
+    #[error("the server is shutting down")]
+    ShuttingDown,
+}
+
+impl Error {
+    /// One field that is wrong.
+    pub fn invalid(
+        field: impl Into<String>,
+        value: impl fmt::Display,
+        expected: impl Into<String>,
+    ) -> Self {
+        Self::InvalidFields(vec![FieldProblem::new(field, value, expected)])
+    }
+
+    /// The fields at fault.
+    pub fn fields(&self) -> Vec<FieldProblem> {
+        match self {
+            Self::InvalidFields(fields) => fields.clone(),
+            Self::UnknownSession { id } => {
+                vec![FieldProblem::new("session_id", id, "the id of an open session")]
+            }
+            Self::UnknownModel { name, served } => {
+                let expected = format!("one of {}", served.join(", "));
+                vec![FieldProblem::new("model", name, expected)]
+            }
+            Self::StepConflict { step } => {
+                let expected = "the observation and outputs that were sent with it before";
+                vec![FieldProblem::new("observation.step", step, expected)]
+            }
+            Self::StepGap { step, expected } => {
+                vec![FieldProblem::new("observation.step", step, expected.to_string())]
+            }
+            Self::SessionMoved { at_step, last } => {
+                vec![FieldProblem::new("at_step", at_step, last.to_string())]
+            }
+            Self::OutputUnavailable { field, output, reason } => {
+                vec![FieldProblem::new(
+                    field,
+                    output,
+                    format!("an output that can be had: {reason}"),
+                )]
+            }
+            _ => Vec::new(),
+        }
+    }
+
+    /// When trying again may help.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Overloaded { retry_after, .. } | Self::TooManySessions { retry_after, .. } => {
+                Some(*retry_after)
+            }
+            Self::ShuttingDown => Some(Duration::from_secs(1)),
+            _ => None,
+        }
+    }
+}
+
+fn list(fields: &[FieldProblem]) -> String {
+    fields.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ")
+}

@@ -1,0 +1,120 @@
+//! The program itself: it starts, says where it listens, serves, and ends when it is told to.
+
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use std::{
+    io::{BufRead as _, BufReader, Read as _},
+    process::{Command, Stdio},
+};
+
+use gatsbi_models::{
+    checkpoint::{AgentSlot, Checkpoint, FirstAction, Header, Precision, Provenance},
+    config::presets,
+    world_model::{ActionDimension, Preprocess},
+};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
+
+fn checkpoint(folder: &std::path::Path) -> std::path::PathBuf {
+    let action = |i: i32| ActionDimension {
+        name: format!("a{i}"),
+        unit: String::new(),
+        offset: 0.0,
+        scale: 1.0,
+    };
+    let header = Header {
+        name: "tiny".to_owned(),
+        model: presets::tiny(),
+        agent_slot: Some(AgentSlot { index: 0, score: None }),
+        actions: (0..7).map(action).collect(),
+        preprocess: Preprocess::Stretch,
+        frame_period: None,
+        first_action: FirstAction::Neutral,
+        provenance: Provenance::default(),
+    };
+    let path = folder.join("tiny.safetensors");
+    Checkpoint::untrained(header, tch::Device::Cpu).save(&path, Precision::Half).unwrap();
+    path
+}
+
+#[test]
+fn it_serves_until_it_is_told_to_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let any = "127.0.0.1:0";
+    let mut server = Command::new(PROGRAM)
+        // It sets what libgomp needs by itself.
+        .env_remove("GOMP_SPINCOUNT")
+        .env_remove("OMP_WAIT_POLICY")
+        .args(["--grpc-listen", any, "--http-listen", any, "--admin-listen", any])
+        .arg("--checkpoint")
+        .arg(format!("arm={}", checkpoint(folder.path()).display()))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(server.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+    let address = |name: &str| {
+        let start = line.find(&format!("{name}=")).unwrap() + name.len() + 1;
+        line[start..].split_whitespace().next().unwrap().to_owned()
+    };
+    assert!(line.starts_with("ready "), "{line}");
+    let environment = std::fs::read(format!("/proc/{}/environ", server.id())).unwrap();
+    let environment = String::from_utf8_lossy(&environment).into_owned();
+    assert!(
+        environment.contains("GOMP_SPINCOUNT=0") && environment.contains("OMP_WAIT_POLICY=PASSIVE")
+    );
+
+    let get = |url: String| {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let response = reqwest::get(url).await.unwrap();
+            (response.status().as_u16(), response.text().await.unwrap())
+        })
+    };
+    assert_eq!(get(format!("http://{}/readyz", address("admin"))).0, 200);
+    let (status, models) = get(format!("http://{}/v1/models", address("http")));
+    assert_eq!(status, 200);
+    assert!(models.contains("\"name\":\"arm\""), "{models}");
+
+    let told = Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap();
+    assert!(told.success());
+    let ended = server.wait().unwrap();
+    let mut log = String::new();
+    server.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+    assert!(ended.success(), "{ended}: {log}");
+    assert!(log.contains("shutting down") && !log.contains("ERROR"), "{log}");
+}
+
+#[test]
+fn it_tells_everything_that_is_wrong_with_its_configuration() {
+    let output = Command::new(PROGRAM)
+        .args(["--http-listen", "0.0.0.0:0", "--observe-block", "0"])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let text = String::from_utf8(output.stderr).unwrap();
+    for part in ["no --checkpoint", "--allow-public", "--observe-block is 0"] {
+        assert!(text.contains(part), "{text}");
+    }
+}
+
+#[test]
+fn a_bad_checkpoint_is_one_sentence_and_its_cause() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("broken.safetensors");
+    std::fs::write(&path, b"not a checkpoint").unwrap();
+    let any = "127.0.0.1:0";
+    let output = Command::new(PROGRAM)
+        .args(["--grpc-listen", any, "--http-listen", any, "--admin-listen", any, "--checkpoint"])
+        .arg(&path)
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(
+        text.contains("error: a checkpoint cannot be loaded: ")
+            && text.contains("broken.safetensors"),
+        "{text}"
+    );
+}
