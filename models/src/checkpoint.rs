@@ -4,7 +4,7 @@
 //! be stored as 16-bit floats; they are 32-bit in memory.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeMap, HashMap},
     io::Write as _,
     path::{Path, PathBuf},
 };
@@ -314,9 +314,23 @@ pub fn save(
         (FORMAT_KEY.to_owned(), VERSION.to_string()),
         (HEADER_KEY.to_owned(), header),
     ]);
-    let bytes = safetensors::serialize(views, Some(metadata)).expect("names and shapes are valid");
+    let mut bytes =
+        safetensors::serialize(views, Some(metadata)).expect("names and shapes are valid");
+    put_in_order(&mut bytes);
     write_atomically(path, &bytes)
         .map_err(|source| CheckpointError::Write { path: path.to_path_buf(), source })
+}
+
+/// Sorts the table of contents of a safetensors file. The library keeps metadata in a hash map, and the same
+/// weights are to be the same bytes, hence have the same hash.
+fn put_in_order(bytes: &mut [u8]) {
+    let (length, rest) = bytes.split_at_mut(8);
+    let length = u64::from_le_bytes(length.try_into().expect("eight bytes"));
+    let table = &mut rest[..length as usize];
+    let entries: BTreeMap<String, BTreeMap<String, serde_json::Value>> =
+        serde_json::from_slice(table).expect("the library writes valid JSON");
+    let ordered = serde_json::to_vec(&entries).expect("plain data serialises");
+    table[..ordered.len()].copy_from_slice(&ordered);
 }
 
 /// Writes a file beside `path`, makes it durable, and moves it there.

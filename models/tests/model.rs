@@ -278,6 +278,9 @@ fn checkpoints_round_trip() {
         let loaded = Checkpoint::load(&path, Device::Cpu).unwrap();
         assert_eq!(loaded.header, original.header);
         assert_eq!(loaded.hash.len(), 64);
+        loaded.save(&path, precision).unwrap();
+        let again = Checkpoint::load(&path, Device::Cpu).unwrap();
+        assert_eq!(again.hash, loaded.hash, "the same weights are the same file");
         for (name, _, tensor) in original.store.iter() {
             let difference = largest_difference(tensor, loaded.store.get(name).unwrap());
             assert!(difference <= tolerance, "{name} {difference}");

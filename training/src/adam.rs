@@ -17,19 +17,14 @@ pub struct Moments {
     steps: i64,
 }
 
-/// The optimiser; parameters that get no gradient are left alone.
+/// The optimiser; parameters that get no gradient, or one of zeros, are left alone, moments and all: a gradient
+/// that was cleared cannot be told from one that never was.
 #[derive(Debug, Default)]
 pub struct Adam {
     moments: BTreeMap<String, Moments>,
-    only: &'static str,
 }
 
 impl Adam {
-    /// An optimiser that moves only parameters whose name starts with `prefix`.
-    pub fn only(prefix: &'static str) -> Self {
-        Self { only: prefix, ..Self::default() }
-    }
-
     /// All state by name: `adam.first.NAME`, `adam.second.NAME`, `adam.steps.NAME`.
     pub fn tensors(&self) -> Vec<(String, Tensor)> {
         self.moments
@@ -70,10 +65,11 @@ impl Adam {
         Ok(())
     }
 
-    /// Scales the gradients to a global norm of at most `clip` and takes a step. Gradients are cleared.
+    /// Scales the gradients to a global norm of at most `clip` and takes a step with the learning rate of each
+    /// parameter's name. Gradients are cleared.
     ///
     /// Returns the norm before clipping; if it is not finite, nothing is changed but the gradients.
-    pub fn step(&mut self, stores: &[&ParamStore], rate: f64, clip: f64) -> f64 {
+    pub fn step(&mut self, stores: &[&ParamStore], rate: impl Fn(&str) -> f64, clip: f64) -> f64 {
         let _no_grad = tch::no_grad_guard();
         let with_gradient: Vec<(&str, &Tensor, Tensor)> = stores
             .iter()
@@ -81,28 +77,36 @@ impl Adam {
             .map(|(name, parameter)| (name, parameter, parameter.grad()))
             .filter(|(_, _, gradient)| gradient.defined())
             .collect();
-        let (with_gradient, idle): (Vec<_>, Vec<_>) =
-            with_gradient.into_iter().partition(|(name, _, _)| name.starts_with(self.only));
         let squares: Vec<Tensor> = with_gradient
             .iter()
             .map(|(_, _, gradient)| gradient.square().sum(Kind::Float))
             .collect();
-        let norm = Tensor::stack(&squares, 0).sum(Kind::Double).double_value(&[]).sqrt();
+        let squares = Tensor::stack(&squares, 0).to_kind(Kind::Double);
+        let squares: Vec<f64> = squares.try_into().expect("one number per parameter");
+        let norm = squares.iter().sum::<f64>().sqrt();
         if norm.is_finite() {
             let factor = (clip / (norm + 1e-6)).min(1.0);
-            for (name, parameter, gradient) in &with_gradient {
+            let moved = with_gradient.iter().zip(&squares).filter(|(_, square)| **square > 0.0);
+            for ((name, parameter, gradient), _) in moved {
                 let moments = self.moments.entry((*name).to_owned()).or_insert_with(|| Moments {
                     first: parameter.zeros_like(),
                     second: parameter.zeros_like(),
                     steps: 0,
                 });
-                moments.step(parameter, &(gradient * factor), rate);
+                moments.step(parameter, &(gradient * factor), rate(name));
             }
         }
-        for (_, parameter, _) in with_gradient.into_iter().chain(idle) {
+        for (_, parameter, _) in with_gradient {
             parameter.shallow_clone().zero_grad();
         }
         norm
+    }
+}
+
+/// Lets exactly those parameters learn whose names `learns` accepts; the others cost no backward pass.
+pub fn select(stores: &[&ParamStore], learns: impl Fn(&str) -> bool) {
+    for (name, parameter) in stores.iter().flat_map(|store| store.trainable()) {
+        let _ = parameter.set_requires_grad(learns(name));
     }
 }
 

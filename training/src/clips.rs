@@ -22,9 +22,10 @@ pub struct Clips {
 
 #[derive(Debug)]
 struct Episode {
-    frames: Tensor,  // [T, 3, H, W] u8
-    motion: Tensor,  // [T, H, W] u8
-    actions: Tensor, // [T, A] raw
+    frames: Tensor,     // [T, 3, H, W] u8
+    foreground: Tensor, // [T, H, W] u8
+    motion: Tensor,     // [T, H, W] u8
+    actions: Tensor,    // [T, A] raw
 }
 
 /// A batch of sequences.
@@ -34,7 +35,9 @@ pub struct Batch {
     pub frames: Vec<Tensor>,
     /// `[T]` scaled actions of `[B, A]`, each the one that led to its frame.
     pub actions: Vec<Tensor>,
-    /// `[T]` motion maps of `[B, 1, H, W]` in [0, 1].
+    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the data set's median.
+    pub foreground: Vec<Tensor>,
+    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the data set's median and from the episode's.
     pub motion: Vec<Tensor>,
 }
 
@@ -58,8 +61,10 @@ impl Clips {
         let episodes: Vec<Episode> = read
             .into_iter()
             .map(|(frames, actions)| {
-                let motion = motion(&frames, &median);
-                Episode { frames, motion, actions }
+                let own = frames.median_dim(0, false).0;
+                let foreground = difference_map(&frames, &median);
+                let motion = foreground.minimum(&difference_map(&frames, &own));
+                Episode { frames, foreground, motion, actions }
             })
             .collect();
         let all = Tensor::cat(&episodes.iter().map(|e| &e.actions).collect::<Vec<_>>(), 0);
@@ -126,7 +131,9 @@ impl Clips {
         };
         let image = |x: Tensor| x.to_kind(Kind::Float) / 255.0;
         let frames = image(stack(&|e, start| e.frames.narrow(0, start, length)));
-        let motion = image(stack(&|e, start| e.motion.narrow(0, start, length))).unsqueeze(2);
+        let map = |x: Tensor| image(x).unsqueeze(2).unbind(0);
+        let foreground = map(stack(&|e, start| e.foreground.narrow(0, start, length)));
+        let motion = map(stack(&|e, start| e.motion.narrow(0, start, length)));
         let actions: Vec<Tensor> = rows
             .iter()
             .map(|(e, start, neutral)| {
@@ -140,7 +147,7 @@ impl Clips {
             })
             .collect();
         let actions = (Tensor::stack(&actions, 1) / &self.scale).to_device(device);
-        Batch { frames: frames.unbind(0), actions: actions.unbind(0), motion: motion.unbind(0) }
+        Batch { frames: frames.unbind(0), actions: actions.unbind(0), foreground, motion }
     }
 }
 
@@ -155,13 +162,10 @@ fn median(episodes: &[(Tensor, Tensor)]) -> Tensor {
     Tensor::cat(&sample, 0).median_dim(0, false).0
 }
 
-/// How much each pixel differs both from the data set's median and from the episode's: what is not background,
-/// and does not rest either. `[T, H, W]` u8.
-fn motion(frames: &Tensor, median: &Tensor) -> Tensor {
+/// Where frames `[T, 3, H, W]` differ from an image, more than shadows do, `[T, H, W]` u8.
+fn difference_map(frames: &Tensor, image: &Tensor) -> Tensor {
     let float = |x: &Tensor| x.to_kind(Kind::Float);
-    let own = frames.median_dim(0, false).0;
-    let difference = |to: &Tensor| (float(frames) - float(to)).abs().amax(1, false) / 255.0;
-    let moved = difference(median).minimum(&difference(&own));
-    let map = ((moved - 0.18) * 25.0).sigmoid();
+    let difference = (float(frames) - float(image)).abs().amax(1, false) / 255.0;
+    let map = ((difference - 0.18) * 25.0).sigmoid();
     (map * 255.0).round().to_kind(Kind::Uint8)
 }

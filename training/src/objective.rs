@@ -6,8 +6,8 @@ use gatsbi_models::{
         keypoint::{KeypointLearning, Keypoints},
         loss,
         mixture::MixtureStep,
-        model::{Gatsbi, GatsbiState, GatsbiStep, GradientStops, Observing},
-        objects::Discover,
+        model::{Gatsbi, GatsbiStep, GradientStops, Observing},
+        objects::{Discover, Rendering},
     },
     noise::{Noise, PhiloxNoise, RowNoise, Site, philox4x32_10},
 };
@@ -65,12 +65,12 @@ impl Terms {
 }
 
 /// How objects are tracked in training: presence is the original product, and new objects come as told.
-pub fn training_tracking() -> Tracking {
+pub fn training_tracking(scale_bounds: Option<(f64, f64)>) -> Tracking {
     Tracking {
         discovery: DiscoveryPolicy::EveryFrame,
         presence: PresenceRule::Product,
         ids: IdRule::Monotone,
-        scale_bounds: None,
+        scale_bounds,
     }
 }
 
@@ -174,6 +174,7 @@ fn add_scene(
     let rows = batch.frames[0].size()[0];
     let device = batch.frames[0].device();
     let objects = recipe.objects.as_ref().filter(|objects| moment.step >= objects.start);
+    let alone = recipe.objects_alone(moment.step);
     let mut state = model.initial_state(rows);
     for (t, frame) in batch.frames.iter().enumerate() {
         let first = state.first();
@@ -182,10 +183,10 @@ fn add_scene(
             if t > 0 && dropped(moment, t, dropout) { Discover::None } else { Discover::All };
         let how = Observing {
             train: true,
-            priors: true,
+            priors: !alone,
             objects: objects.is_some(),
             discover,
-            tracking: training_tracking(),
+            tracking: training_tracking(objects.and_then(|objects| objects.scale_bounds)),
             stops: GradientStops::default(),
         };
         let noise = DampedNoise {
@@ -194,8 +195,10 @@ fn add_scene(
         };
         let (next, seen) = model.observe(state, frame, &batch.actions[t], &noise, how);
         state = next;
-        add_mixture(terms, recipe, &seen.mixture, frame, &first, moment.step);
-        if let Some(slot) = model.agent_slot() {
+        if !alone {
+            add_mixture(terms, recipe, &seen.mixture, frame, &first, moment.step);
+        }
+        if let (false, Some(slot)) = (alone, model.agent_slot()) {
             let agent = seen.mixture.log_masks.select(1, slot).exp();
             let motion = loss::keypoint_regression(&batch.motion[t], &agent);
             terms.add("to_motion", motion, recipe.regression.motion.at(moment.step));
@@ -205,7 +208,15 @@ fn add_scene(
             }
         }
         if let Some(objects) = objects {
-            add_objects(terms, model, objects, &state, &seen, frame, &first, moment.step);
+            let rendering = model.render(&state);
+            let rest = match model.agent_slot() {
+                Some(slot) => 1.0 - seen.mixture.log_masks.select(1, slot).exp().detach(),
+                None => batch.foreground[t].ones_like(),
+            };
+            let target = &batch.foreground[t] * rest;
+            let to_objects = loss::keypoint_regression(&target, &rendering.alpha);
+            terms.add("to_objects", to_objects, recipe.regression.objects.at(moment.step));
+            add_objects(terms, model, objects, &rendering, &seen, frame, &first, moment.step);
         }
     }
 }
@@ -237,14 +248,13 @@ fn add_objects(
     terms: &mut Terms,
     model: &Gatsbi,
     recipe: &ObjectRecipe,
-    state: &GatsbiState,
+    rendering: &Rendering,
     seen: &GatsbiStep,
     frame: &Tensor,
     first: &Tensor,
     step: u64,
 ) {
     let mixture = &seen.mixture;
-    let rendering = model.render(state);
     let window = recipe.fixed_alpha.filter(|window| step < window.end);
     let weight = recipe.composite.at(step);
     if weight > 0.0 {

@@ -37,6 +37,25 @@ pub struct Recipe {
     pub save_every: u64,
 }
 
+impl Recipe {
+    /// Whether nothing but the objects learns at `step`.
+    pub fn objects_alone(&self, step: u64) -> bool {
+        self.objects
+            .as_ref()
+            .is_some_and(|objects| (objects.start..objects.alone_until).contains(&step))
+    }
+
+    /// Learning rate of the parameter called `name` at `step`; 0 if it rests.
+    pub fn rate_of(&self, name: &str, step: u64) -> f64 {
+        let rate = self.learning_rate.at(step);
+        match &self.objects {
+            Some(objects) if name.starts_with("objects.") => rate * objects.rate,
+            _ if self.objects_alone(step) => 0.0,
+            _ => rate,
+        }
+    }
+}
+
 /// Terms of the keypoint module (mixture spec 4).
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[serde(deny_unknown_fields)]
@@ -88,6 +107,13 @@ pub struct MixtureRecipe {
 pub struct ObjectRecipe {
     /// First step with objects.
     pub start: u64,
+    /// Up to this step nothing but the objects learns.
+    pub alone_until: u64,
+    /// Factor on the learning rate of the object module.
+    pub rate: f64,
+    /// Bounds of a box's side as a fraction of the image. Without them a few faint boxes grow over the whole
+    /// image and correct the background's colours, instead of being objects.
+    pub scale_bounds: Option<(f64, f64)>,
     /// Standard deviation of both likelihoods below.
     pub sigma: f64,
     /// Weight of the Gaussian likelihood of the composite image.
@@ -114,15 +140,18 @@ pub struct FixedAlpha {
     pub end: u64,
 }
 
-/// Onto which maps the agent's mask is regressed, and with which weights of the squared difference.
+/// Onto which maps masks are regressed, and with which weights of the squared difference.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct RegressionRecipe {
-    /// The keypoint map (the paper's).
+    /// The agent's mask onto the keypoint map (the paper's).
     pub keypoints: Ramp,
-    /// The motion map: what differs both from the data's and from the episode's median. It leads where
-    /// keypoints learn too slowly; it contains moving objects too.
+    /// The agent's mask onto the motion map: what differs both from the data's and from the episode's median. It
+    /// leads where keypoints learn too slowly; it contains moving objects too.
     pub motion: Ramp,
+    /// The objects' alpha onto what differs from the data's median and is not the agent's. It leads the boxes to
+    /// objects before glimpses can be drawn well enough to be worth their place.
+    pub objects: Ramp,
 }
 
 /// A number that is linear between given steps and constant outside.

@@ -21,7 +21,7 @@ use gatsbi_models::{
 use tch::{Device, Kind};
 
 use crate::{
-    adam::Adam,
+    adam::{self, Adam},
     clips::{Batch, Clips},
     evaluation::{self, Recorded},
     journal::Journal,
@@ -143,14 +143,15 @@ impl Trainer {
             let length = self.recipe.length.at(moment.step) as i64;
             let batch = self.batch(clips, moment.step, length);
             let learning = self.learning.as_ref();
+            let stores = [&self.checkpoint.store, &self.learning_store];
+            let rate = |name: &str| self.recipe.rate_of(name, moment.step);
+            adam::select(&stores, |name| rate(name) > 0.0);
             let objective =
                 objective(&self.checkpoint.model, learning, &self.recipe, &batch, moment);
             let loss = objective.loss.double_value(&[]);
             let mut norm = f64::NAN;
             if loss.is_finite() {
                 objective.loss.backward();
-                let stores = [&self.checkpoint.store, &self.learning_store];
-                let rate = self.recipe.learning_rate.at(moment.step);
                 norm = self.adam.step(&stores, rate, self.recipe.clip);
             }
             self.progress.step += 1;
@@ -230,7 +231,9 @@ impl Trainer {
         let median = clips.median.to_device(self.device).unsqueeze(0);
         let rows = self.recipe.batch;
         // The encoders must not learn to ignore the frame, which a constant target would teach them.
-        let mut adam = Adam::only("mixture.comp_decoder");
+        let stores = [&self.checkpoint.store];
+        adam::select(&stores, |name| name.starts_with("mixture.comp_decoder"));
+        let mut adam = Adam::default();
         for step in PREFIT_STEPS..PREFIT_STEPS + prefit.steps {
             let batch = self.batch(clips, step, 1);
             let how = Observing {
@@ -238,7 +241,7 @@ impl Trainer {
                 priors: false,
                 objects: false,
                 discover: Discover::None,
-                tracking: training_tracking(),
+                tracking: training_tracking(None),
                 stops: GradientStops::default(),
             };
             let noise = noise(Moment { step, ..self.moment() }, 0, rows, self.device);
@@ -247,7 +250,7 @@ impl Trainer {
             let error = (seen.mixture.components.select(1, last) - &median).square();
             let loss = error.sum(Kind::Float) / rows as f64;
             loss.backward();
-            adam.step(&[&self.checkpoint.store], prefit.learning_rate, self.recipe.clip * 10.0);
+            adam.step(&stores, |_| prefit.learning_rate, self.recipe.clip * 10.0);
             if step + 1 == PREFIT_STEPS + prefit.steps {
                 let error = loss.double_value(&[]) / median.numel() as f64;
                 journal.say(&format!("background prefit: mean squared error {error:.5}"));

@@ -1,0 +1,87 @@
+//! A run that is stopped and resumed gives the numbers of one that was not.
+
+#![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
+
+use std::path::Path;
+
+use gatsbi_episodes::Dataset;
+use gatsbi_models::checkpoint::{Checkpoint, Header};
+use gatsbi_training::{clips::Clips, recipe::Recipe, trainer::Trainer};
+use tch::{Device, Tensor};
+
+const STEPS: u64 = 4;
+
+/// Every stage in four steps: background prefit, mixture, objects alone, all together, with keypoints.
+const RECIPE: &str = r#"
+name = "resumed"
+model = "tiny"
+steps = 4
+batch = 2
+length = [[0, 2], [3, 3]]
+learning_rate = [[0, 1e-3], [2, 5e-4]]
+clip = 1.0
+picture_every = 0
+save_every = 2
+prefit = { steps = 2, learning_rate = 1e-3 }
+
+[mixture]
+start = 0
+sigma = 0.1
+likelihood = [[0, 1.0], [2, 0.5]]
+kl = [[0, 0.0], [4, 1.0]]
+residual = 0.01
+noise = 1.0
+
+[objects]
+start = 1
+alone_until = 2
+rate = 2.0
+scale_bounds = [0.04, 0.3]
+sigma = 0.1
+composite = 1.0
+joint = 0.5
+kl = 1.0
+discovery_dropout = 0.5
+scale_mean = -2.0
+
+[regression]
+keypoints = 1.0
+motion = 1.0
+objects = 1.0
+
+[keypoints]
+end = 3
+separation = 20.0
+sparsity = 0.002
+kl = 0.001
+networks = { recurrent = 16, latent = 4, mlp = 16, samples = 2 }
+"#;
+
+/// What a run in `folder` that stops at each of `stops` ends with.
+fn trained(clips: &Clips, folder: &Path, stops: &[u64]) -> (Header, Vec<(String, Tensor)>) {
+    let recipe: Recipe = toml::from_str(RECIPE).unwrap();
+    for &stop in stops {
+        let mut trainer =
+            Trainer::open(recipe.clone(), clips, "sample", 7, folder, Device::Cpu).unwrap();
+        trainer.run(clips, Some(stop)).unwrap();
+        assert_eq!(trainer.step(), stop);
+    }
+    let checkpoint = Checkpoint::load(&folder.join("checkpoint.safetensors"), Device::Cpu).unwrap();
+    let weights = checkpoint.store.iter();
+    let weights = weights.map(|(name, _, weight)| (name.to_owned(), weight.detach())).collect();
+    (checkpoint.header, weights)
+}
+
+#[test]
+fn a_resumed_run_ends_where_an_uninterrupted_one_does() {
+    tch::set_num_threads(1);
+    let sample =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples/push1-heldout.parquet");
+    let clips = Clips::read(&Dataset::open(sample).unwrap(), 0..2).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let once = trained(&clips, &folder.path().join("once"), &[STEPS]);
+    let resumed = trained(&clips, &folder.path().join("resumed"), &[1, 2, STEPS]);
+    assert!(once == resumed, "the resumed run ended with other weights");
+    let other = trained(&clips, &folder.path().join("other"), &[STEPS - 1]);
+    assert!(once != other, "the last step changed nothing");
+}
