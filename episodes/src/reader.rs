@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use crate::{
     DatasetInfo, Episode, Error, InvalidEpisode, Manifest, Result,
     schema::{COLUMNS, column as c},
-    shard::{Shard, sha256_of},
+    shard::{Shard, hex, sha256_of},
     table::Rows,
 };
 
@@ -36,6 +36,8 @@ pub struct EpisodeSummary {
     pub object_count: Option<u32>,
     /// The generator's seed, where it is recorded.
     pub seed: Option<u64>,
+    /// Hash of the simulator's states in hexadecimal, where it is recorded.
+    pub state_hash: Option<String>,
 }
 
 impl Dataset {
@@ -119,7 +121,8 @@ impl Dataset {
     /// [`Error::Decode`] for a damaged page, [`Error::Row`] for a null.
     pub fn summaries(&self) -> Result<Vec<EpisodeSummary>> {
         let mut summaries = Vec::new();
-        self.scan(&[c::EPISODE_ID, c::LENGTH, c::OBJECT_COUNT, c::SEED], |cells, row| {
+        let columns = [c::EPISODE_ID, c::LENGTH, c::OBJECT_COUNT, c::STATE_HASH, c::SEED];
+        self.scan(&columns, |cells, row| {
             let null = |column| InvalidEpisode::Null { column };
             summaries.push(EpisodeSummary {
                 index: summaries.len(),
@@ -127,6 +130,7 @@ impl Dataset {
                 length: cells.u32(c::LENGTH, row).ok_or_else(|| null(c::LENGTH))? as usize,
                 object_count: cells.u32(c::OBJECT_COUNT, row),
                 seed: cells.u64(c::SEED, row),
+                state_hash: cells.hash(c::STATE_HASH, row).map(|hash| hex(&hash)),
             });
             Ok(())
         })?;

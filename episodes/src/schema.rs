@@ -4,7 +4,7 @@
 //! in zstd pages, lossless: measured on 64x64 simulator frames they are as small as any other lossless container and open in
 //! pandas, Polars and `DuckDB` without a plugin.
 //!
-//! Letters: `T` frames, `H` height, `W` width, `C` = 3 channels (red, green, blue), `A` action dimensions, `N` objects,
+//! Letters: `T` frames, `H` height, `W` width, `C` = 3 channels (red, green, blue), `A` action dimensions (0 where nobody acts), `N` objects,
 //! `J` joints. All arrays are row-major with the last axis fastest. Lengths are metres, world frame; quaternions are w, x, y, z.
 //!
 //! | column | Parquet / Arrow type | null | contents |
@@ -62,7 +62,7 @@ pub struct DatasetInfo {
     pub channels: u32,
     /// Seconds between two frames.
     pub frame_period_seconds: f64,
-    /// The `A` dimensions of an action, in order.
+    /// The `A` dimensions of an action, in order; none where nobody acts.
     pub actions: Vec<ActionDimension>,
     /// What the values of `mask` stand for; `None` where they are not described.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -159,9 +159,6 @@ impl DatasetInfo {
         if !(self.frame_period_seconds.is_finite() && self.frame_period_seconds > 0.0) {
             let found = self.frame_period_seconds.to_string();
             return fail("frame_period_seconds", found, "a positive number of seconds");
-        }
-        if self.actions.is_empty() {
-            return fail("actions", "empty".into(), "at least one dimension");
         }
         if let Some(labels) = self.labels
             && (labels.background == labels.agent
@@ -328,7 +325,6 @@ mod tests {
         rejects(|i| i.channels = 1, "channels");
         rejects(|i| i.frame_period_seconds = f64::NAN, "frame_period_seconds");
         rejects(|i| i.frame_period_seconds = 0.0, "frame_period_seconds");
-        rejects(|i| i.actions.clear(), "actions");
         rejects(|i| i.labels.as_mut().unwrap().agent = 0, "labels");
         rejects(|i| i.labels.as_mut().unwrap().first_object = 1, "labels");
     }

@@ -62,7 +62,7 @@ pub(crate) struct Shard {
 pub(crate) fn sha256_of(path: &Path) -> io::Result<String> {
     let mut hasher = Sha256::new();
     io::copy(&mut fs_err::File::open(path)?, &mut HashOnly(&mut hasher))?;
-    Ok(hex(hasher))
+    Ok(hex(&hasher.finalize()))
 }
 
 // === impl ShardWriter ===
@@ -104,8 +104,13 @@ impl ShardWriter {
         let Hashed { file, hasher, bytes } = done;
         file.commit()?;
         let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let entry =
-            ShardEntry { file, episodes: ids.len() as u64, frames, bytes, sha256: hex(hasher) };
+        let entry = ShardEntry {
+            file,
+            episodes: ids.len() as u64,
+            frames,
+            bytes,
+            sha256: hex(&hasher.finalize()),
+        };
         Ok((entry, ids))
     }
 }
@@ -317,8 +322,9 @@ impl Write for HashOnly<'_> {
     }
 }
 
-fn hex(hasher: Sha256) -> String {
-    hasher.finalize().iter().fold(String::new(), |mut text, byte| {
+/// Bytes as two lower-case digits each.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
         write!(text, "{byte:02x}").ok();
         text
     })

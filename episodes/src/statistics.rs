@@ -32,7 +32,7 @@ impl Dataset {
         self.scan(&[column::ACTIONS], |cells, row| {
             let null = || InvalidEpisode::Null { column: column::ACTIONS };
             let actions = cells.floats(column::ACTIONS, row)?.ok_or_else(null)?;
-            for (frame, action) in actions.chunks(dimensions.len()).enumerate() {
+            for (frame, action) in actions.chunks(dimensions.len().max(1)).enumerate() {
                 for (dimension, (&value, running)) in action.iter().zip(&mut running).enumerate() {
                     if !value.is_finite() {
                         let column = column::ACTIONS;

@@ -91,7 +91,7 @@ impl<'a> Rows<'a> {
         Some(array.value(row).to_vec())
     }
 
-    fn hash(&self, column: &str, row: usize) -> Option<[u8; 32]> {
+    pub(crate) fn hash(&self, column: &str, row: usize) -> Option<[u8; 32]> {
         let array: &FixedSizeBinaryArray = self.cell(column, row)?.as_fixed_size_binary();
         array.value(row).try_into().ok()
     }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use axum::serve::ListenerExt as _;
-use gatsbi_models::{checkpoint::CheckpointError, gatsbi::world::GatsbiWorld};
+use gatsbi_models::checkpoint::CheckpointError;
 use gatsbi_proto::v1::{
     FILE_DESCRIPTOR_SET,
     imagination_service_server::{self, ImaginationServiceServer},
@@ -21,8 +21,10 @@ use tonic::transport::{Server, server::TcpIncoming};
 
 use crate::{
     api::{admin, grpc::Grpc, rest},
+    checkpoints::Checkpoints,
     config::Config,
-    engine::{Engine, EngineError, LoadedModel},
+    engine::{Engine, EngineError, models::LoadedModel},
+    error::told,
     service::Service,
     telemetry,
 };
@@ -37,7 +39,7 @@ pub struct App {
     /// Where administration listens.
     pub admin: SocketAddr,
     stop: CancellationToken,
-    ready: watch::Sender<bool>,
+    ready: watch::Sender<Option<Arc<Service>>>,
     tasks: JoinSet<Result<(), String>>,
     engine_ended: watch::Receiver<bool>,
     drain: Duration,
@@ -52,6 +54,9 @@ pub enum StartError {
     /// A checkpoint cannot be loaded.
     #[error("a checkpoint cannot be loaded")]
     Checkpoint(#[from] CheckpointError),
+    /// The folder of checkpoints cannot be read.
+    #[error("the folder of checkpoints cannot be read")]
+    Folder(#[source] std::io::Error),
     /// Two models have the same name.
     #[error("two models are called {0}; NAME=PATH gives them names")]
     SameName(String),
@@ -72,7 +77,8 @@ pub enum StartError {
     CutOff(#[from] tokio::task::JoinError),
 }
 
-/// Loads the checkpoints that a configuration names, with the cards beside them.
+/// Loads the checkpoints that a configuration names, with the cards beside them, and those in its folder. One that is
+/// named must be there; one that is found and is no good is logged and left out.
 ///
 /// # Errors
 /// If one cannot be loaded, or two have the same name.
@@ -80,16 +86,26 @@ pub fn load(config: &Config) -> Result<Vec<LoadedModel>, StartError> {
     // The first operation decides how many threads later ones have.
     tch::set_num_threads(config.engine().threads as i32);
     let mut models: Vec<LoadedModel> = Vec::new();
-    for checkpoint in &config.checkpoints {
-        let world = GatsbiWorld::load(&checkpoint.path, config.device.0)?;
-        let spec = gatsbi_models::world_model::WorldModel::spec(&world);
-        let name = checkpoint.name.clone().unwrap_or_else(|| spec.name.clone());
-        if models.iter().any(|model| model.name == name) {
-            return Err(StartError::SameName(name));
+    let mut add = |model: LoadedModel| {
+        if models.iter().any(|known| known.name == model.name) {
+            return Err(StartError::SameName(model.name));
         }
-        tracing::info!(model = name, hash = spec.hash, steps = spec.trained_steps, "model loaded");
-        let card = fs_err::read_to_string(checkpoint.path.with_extension("md")).unwrap_or_default();
-        models.push(LoadedModel { world: Box::new(world), name, card });
+        models.push(model);
+        Ok(())
+    };
+    let named = Checkpoints { folder: None, ..config.checkpoints() };
+    for checkpoint in &config.checkpoints {
+        add(named.load(&checkpoint.path, checkpoint.name.as_deref())?)?;
+    }
+    let folder = config.checkpoints();
+    for path in folder.found().map_err(StartError::Folder)? {
+        match folder.load(&path, None) {
+            Ok(model) => add(model)?,
+            Err(error) => {
+                let (error, path) = (told(&error), path.display());
+                tracing::error!(%path, error, "a checkpoint is left out");
+            }
+        }
     }
     Ok(models)
 }
@@ -106,7 +122,7 @@ impl App {
     ) -> Result<Self, StartError> {
         let metrics = telemetry::metrics();
         let stop = CancellationToken::new();
-        let (ready, readiness) = watch::channel(false);
+        let (ready, readiness) = watch::channel(None);
         let mut tasks = JoinSet::new();
 
         let (admin, listener) = listen(config.admin_listen).await?;
@@ -115,10 +131,12 @@ impl App {
         let (http, http_listener) = listen(config.http_listen).await?;
 
         let drain = Duration::from_secs(config.drain_seconds);
-        let (engine, thread, config) = tokio::task::spawn_blocking(move || {
+        let (engine, models, thread, config) = tokio::task::spawn_blocking(move || {
             let models = load(&config)?;
-            let (engine, thread) = Engine::start(models, config.engine())?;
-            Ok::<_, StartError>((engine, thread, config))
+            let (engine, thread) = Engine::start(config.engine())?;
+            let models: Result<Vec<_>, _> =
+                models.into_iter().map(|model| engine.serve(model)).collect();
+            Ok::<_, StartError>((engine, models?, thread, config))
         })
         .await??;
         let (ended, engine_ended) = watch::channel(false);
@@ -129,11 +147,11 @@ impl App {
             ended.send_replace(true);
         });
 
-        let service = Arc::new(Service::new(engine, &config, stop.clone()));
+        let service = Arc::new(Service::new(engine, models, &config, stop.clone()));
         tasks.spawn(sweep(Arc::downgrade(&service), metrics, stop.clone()));
         tasks.spawn(self::http(http_listener, rest::router(Arc::clone(&service)), &stop));
-        tasks.spawn(self::grpc(grpc_listener, service, stop.clone()));
-        ready.send_replace(true);
+        tasks.spawn(self::grpc(grpc_listener, Arc::clone(&service), stop.clone()));
+        ready.send_replace(Some(service));
         Ok(Self { grpc, http, admin, stop, ready, tasks, engine_ended, drain })
     }
 
@@ -146,7 +164,7 @@ impl App {
     /// Ends: takes no more requests, gives those on their way the time to finish that the configuration says, and
     /// waits for the engine.
     pub async fn shutdown(mut self) {
-        self.ready.send_replace(false);
+        self.ready.send_replace(None);
         self.stop.cancel();
         let drained = async { while self.tasks.join_next().await.is_some() {} };
         if tokio::time::timeout(self.drain, drained).await.is_err() {
@@ -232,7 +250,7 @@ async fn sweep(
             () = stop.cancelled() => return Ok(()),
         }
         let Some(service) = service.upgrade() else { return Ok(()) };
-        let (count, bytes) = service.registry().sweep(Instant::now());
+        let (count, bytes) = service.sweep(Instant::now());
         telemetry::sessions(count, bytes);
         metrics.run_upkeep();
     }

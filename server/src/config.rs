@@ -4,7 +4,10 @@ use std::{net::SocketAddr, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::Parser;
 
-use crate::engine::{DoorSizes, EngineConfig, scheduler::Sizes};
+use crate::{
+    checkpoints::Checkpoints,
+    engine::{DoorSizes, EngineConfig, scheduler::Sizes},
+};
 
 /// Serves GATSBI world models to robot agents over gRPC and REST.
 #[derive(Clone, Debug, Parser)]
@@ -14,6 +17,11 @@ pub struct Config {
     /// the extension .md) is served with it.
     #[arg(long = "checkpoint", env = "GATSBI_CHECKPOINTS", value_delimiter = ',')]
     pub checkpoints: Vec<CheckpointArg>,
+
+    /// Folder of checkpoints: all that are in it are served, and relative paths of models that are loaded later start
+    /// there.
+    #[arg(long, env = "GATSBI_CHECKPOINT_FOLDER")]
+    pub checkpoint_folder: Option<PathBuf>,
 
     /// Where models compute: cpu, or cuda:N.
     #[arg(long, env = "GATSBI_DEVICE", default_value = "cpu")]
@@ -53,7 +61,7 @@ pub struct Config {
     #[arg(long, env = "GATSBI_TICK_MILLIS", default_value_t = 20)]
     pub tick_millis: u64,
 
-    /// Rows of rollouts that are on their way at once, at least one block.
+    /// Rows of rollouts that are on their way at once, at least two blocks.
     #[arg(long, env = "GATSBI_ARENA_ROWS", default_value_t = 512)]
     pub arena_rows: usize,
 
@@ -100,6 +108,10 @@ pub struct Config {
     /// Sessions that are kept; more are refused.
     #[arg(long, env = "GATSBI_MAX_SESSIONS", default_value_t = 10_000)]
     pub max_sessions: usize,
+
+    /// Earlier steps and frames that sessions keep, and rows of handles, in MiB; more are refused.
+    #[arg(long, env = "GATSBI_MAX_KEPT_MIB", default_value_t = 1024)]
+    pub max_kept_mib: u64,
 
     /// How long a session may lie unused, in seconds.
     #[arg(long, env = "GATSBI_SESSION_TTL_SECONDS", default_value_t = 3600)]
@@ -176,7 +188,10 @@ impl Config {
                 problems.push(problem);
             }
         };
-        check(!self.checkpoints.is_empty(), "no --checkpoint is given".to_owned());
+        check(
+            !self.checkpoints.is_empty() || self.checkpoint_folder.is_some(),
+            "no --checkpoint or --checkpoint-folder is given".to_owned(),
+        );
         for (flag, address) in [
             ("--grpc-listen", self.grpc_listen),
             ("--http-listen", self.http_listen),
@@ -193,7 +208,7 @@ impl Config {
             ("--threads", self.threads, 0..=1024),
             ("--observe-block", self.observe_block, 1..=1024),
             ("--imagine-block", self.imagine_block, 1..=1024),
-            ("--arena-rows", self.arena_rows, self.imagine_block..=1 << 20),
+            ("--arena-rows", self.arena_rows, 2 * self.imagine_block..=1 << 20),
             ("--max-observes", self.max_observes, 1..=1 << 20),
             ("--max-rows", self.max_rows, self.max_request_rows as usize..=1 << 24),
             ("--max-request-rows", self.max_request_rows as usize, 1..=1 << 20),
@@ -209,6 +224,7 @@ impl Config {
                 1..=self.max_output_mib as usize,
             ),
             ("--max-sessions", self.max_sessions, 1..=1 << 24),
+            ("--max-kept-mib", self.max_kept_mib as usize, 1..=1 << 20),
             ("--session-ttl-seconds", self.session_ttl_seconds as usize, 1..=1 << 30),
         ] {
             check(
@@ -224,6 +240,11 @@ impl Config {
             );
         }
         problems
+    }
+
+    /// Where checkpoints come from, and where they go.
+    pub fn checkpoints(&self) -> Checkpoints {
+        Checkpoints { folder: self.checkpoint_folder.clone(), device: self.device.0 }
     }
 
     /// Sizes of the engine.
@@ -252,7 +273,8 @@ mod tests {
 
     #[test]
     fn defaults_lack_nothing_but_a_checkpoint() {
-        assert_eq!(Config::default().problems(), ["no --checkpoint is given"]);
+        let problem = "no --checkpoint or --checkpoint-folder is given";
+        assert_eq!(Config::default().problems(), [problem]);
     }
 
     #[test]

@@ -74,6 +74,45 @@ pub enum Error {
         /// Those that are served.
         served: Vec<String>,
     },
+    /// Handles that do not exist, or no longer.
+    #[error("there are no handles {id}")]
+    UnknownHandles {
+        /// The id that was given.
+        id: String,
+    },
+    /// Handles that are not where the request believes them to be, or that were stepped otherwise.
+    #[error("the handles were stepped {stepped} times, not {step}")]
+    HandlesMoved {
+        /// What was given.
+        step: u64,
+        /// What is so.
+        stepped: u64,
+    },
+    /// A checkpoint that cannot be served.
+    #[error("the checkpoint {path} cannot be served: {reason}")]
+    BadCheckpoint {
+        /// Its path.
+        path: String,
+        /// Why.
+        reason: String,
+    },
+    /// A name that another model has.
+    #[error("there is a model {name} already")]
+    ModelExists {
+        /// The name.
+        name: String,
+    },
+    /// A model that sessions use.
+    #[error("model {name} has {sessions} sessions; close_sessions closes them")]
+    ModelInUse {
+        /// The name.
+        name: String,
+        /// How many.
+        sessions: usize,
+    },
+    /// The server has not started yet.
+    #[error("the server is starting")]
+    Starting,
     /// A path that leads nowhere.
     #[error("there is nothing at {path}")]
     UnknownPath {
@@ -110,6 +149,26 @@ pub enum Error {
         /// The last step observed.
         last: u64,
     },
+    /// An earlier step that the session did not keep.
+    #[error("step {to_step} was not kept: {}", kept(*.oldest, *.last))]
+    StepNotKept {
+        /// The step that was given.
+        to_step: u64,
+        /// The earliest step that was kept, if any was.
+        oldest: Option<u64>,
+        /// The last step observed.
+        last: u64,
+    },
+    /// A snapshot of a model that is not served, or not the session's.
+    #[error("the snapshot is of checkpoint {found}, {expected}")]
+    ForeignSnapshot {
+        /// Path of the field.
+        field: String,
+        /// Hash of the snapshot's checkpoint.
+        found: String,
+        /// What it should be.
+        expected: String,
+    },
     /// A session without a belief.
     #[error("the session has observed nothing yet")]
     NothingObserved,
@@ -129,6 +188,26 @@ pub enum Error {
         /// Of what there is too much.
         what: &'static str,
         /// When it should have become less.
+        retry_after: Duration,
+    },
+    /// An answer that cannot be there in time.
+    #[error("the answer needs {}, the deadline is in {}", seconds(*.needs), seconds(*.within))]
+    TooSlow {
+        /// How long it takes, as far as is known.
+        needs: Duration,
+        /// When it is of no use any more.
+        within: Duration,
+        /// When it could be there in time, if that is only because of other work.
+        retry_after: Option<Duration>,
+    },
+    /// More memory than the server keeps for what clients want kept.
+    #[error(
+        "the server keeps no more than {limit_bytes} bytes of earlier steps, frames and handles"
+    )]
+    TooMuchKept {
+        /// The limit.
+        limit_bytes: u64,
+        /// When the next session expires.
         retry_after: Duration,
     },
     /// More sessions than the server keeps.
@@ -176,6 +255,19 @@ impl Error {
             Self::UnknownSession { id } => {
                 vec![FieldProblem::new("session_id", id, "the id of an open session")]
             }
+            Self::UnknownHandles { id } => {
+                vec![FieldProblem::new("handles_id", id, "the id of open handles")]
+            }
+            Self::BadCheckpoint { path, reason } => {
+                let expected = format!("a checkpoint that can be served: {reason}");
+                vec![FieldProblem::new("path", path, expected)]
+            }
+            Self::ModelExists { name } => {
+                vec![FieldProblem::new("name", name, "a name that no model has")]
+            }
+            Self::HandlesMoved { step, stepped } => {
+                vec![FieldProblem::new("step", step, stepped.to_string())]
+            }
             Self::UnknownModel { name, served } => {
                 let expected = format!("one of {}", served.join(", "));
                 vec![FieldProblem::new("model", name, expected)]
@@ -189,6 +281,12 @@ impl Error {
             }
             Self::SessionMoved { at_step, last } => {
                 vec![FieldProblem::new("at_step", at_step, last.to_string())]
+            }
+            Self::StepNotKept { to_step, oldest, last } => {
+                vec![FieldProblem::new("to_step", to_step, kept(*oldest, *last))]
+            }
+            Self::ForeignSnapshot { field, found, expected } => {
+                vec![FieldProblem::new(field, format!("of checkpoint {found}"), expected)]
             }
             Self::OutputUnavailable { field, output, reason } => {
                 vec![FieldProblem::new(
@@ -204,13 +302,32 @@ impl Error {
     /// When trying again may help.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
-            Self::Overloaded { retry_after, .. } | Self::TooManySessions { retry_after, .. } => {
-                Some(*retry_after)
-            }
-            Self::ShuttingDown => Some(Duration::from_secs(1)),
+            Self::Overloaded { retry_after, .. }
+            | Self::TooManySessions { retry_after, .. }
+            | Self::TooMuchKept { retry_after, .. } => Some(*retry_after),
+            Self::TooSlow { retry_after, .. } => *retry_after,
+            Self::Starting | Self::ShuttingDown => Some(Duration::from_secs(1)),
             _ => None,
         }
     }
+}
+
+/// Which steps a session can return to, in words.
+fn kept(oldest: Option<u64>, last: u64) -> String {
+    match oldest {
+        Some(oldest) => format!("a step of {oldest} to {last}"),
+        None => format!("step {last}: the session keeps no earlier ones (keep_steps)"),
+    }
+}
+
+fn seconds(time: Duration) -> String {
+    format!("{:.3} s", time.as_secs_f64())
+}
+
+/// An error and its causes as one sentence.
+pub fn told(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(error.source(), |cause| cause.source());
+    causes.fold(error.to_string(), |told, cause| format!("{told}: {cause}"))
 }
 
 fn list(fields: &[FieldProblem]) -> String {

@@ -8,6 +8,7 @@
 
 pub mod api;
 pub mod app;
+pub mod checkpoints;
 pub mod config;
 pub mod engine;
 pub mod error;

@@ -1,46 +1,84 @@
 //! The use cases. gRPC and REST are thin skins over this, and tests may call it directly.
 //!
-//! Requests and answers are the messages of the wire; whatever is wrong with them comes back as [`Error`]. What
-//! models there are and which sessions are open is answered here; observing is in [`observe`], imagining in
-//! [`imagine`].
+//! Requests and answers are the messages of the wire; whatever is wrong with them comes back as [`Error`]. A file a
+//! use case: [`models`], [`sessions`] and [`snapshots`], then [`observe`] and [`imagine`].
 
+mod administration;
 mod answer;
 mod fields;
-pub mod imagine;
-pub mod observe;
+mod handles;
+mod imagine;
+mod models;
+mod observe;
+pub mod predict;
+pub mod rollout;
+mod sessions;
+mod snapshots;
+mod spread;
+mod start;
 
 use std::{
     sync::Arc,
-    time::{Duration, Instant, SystemTime},
+    time::{Duration, Instant},
 };
 
-use gatsbi_models::world_model::Preprocess;
 use gatsbi_proto::v1;
+use sha2::{Digest as _, Sha256};
 use tokio_util::sync::CancellationToken;
 
+use self::{handles::Opened, models::Catalogue};
 use crate::{
+    checkpoints::Checkpoints,
     config::Config,
-    engine::{Engine, commands::ModelEntry},
+    engine::{Engine, commands::Tenant, models::ModelEntry},
     error::Error,
-    sessions::registry::{NewSession, Registry, Session, SessionId},
+    sessions::{
+        registry::{Limits, Registry},
+        session::Session,
+    },
 };
-
-/// Characters of a label.
-const LABEL: usize = 128;
 
 /// The use cases.
 #[derive(Debug)]
 pub struct Service {
     engine: Engine,
+    catalogue: Catalogue,
     registry: Registry,
+    handles: Opened,
     limits: v1::Limits,
+    kept: Limits,
     ttl: Duration,
+    checkpoints: Checkpoints,
+    /// Held by whatever changes the models: one after the other.
+    changing: tokio::sync::Mutex<()>,
     stop: CancellationToken,
 }
 
+/// What a call says about itself beside its request.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Call {
+    /// When an answer is of no use any more.
+    pub deadline: Option<Instant>,
+    /// Whose it is; the session's own if absent.
+    pub tenant: Option<Tenant>,
+}
+
+impl Call {
+    /// The tenant of a name that a client gives itself.
+    pub fn tenant_named(name: &[u8]) -> Tenant {
+        let digest = Sha256::digest(name);
+        Tenant(digest.iter().take(16).fold(0, |bits, byte| bits << 8 | u128::from(*byte)))
+    }
+}
+
 impl Service {
-    /// The use cases over an engine; streams end when `stop` is cancelled.
-    pub fn new(engine: Engine, config: &Config, stop: CancellationToken) -> Self {
+    /// The use cases over an engine and the models that it serves; streams end when `stop` is cancelled.
+    pub fn new(
+        engine: Engine,
+        models: Vec<Arc<ModelEntry>>,
+        config: &Config,
+        stop: CancellationToken,
+    ) -> Self {
         let limits = v1::Limits {
             max_candidates: config.max_candidates,
             max_horizon: config.max_horizon,
@@ -50,8 +88,19 @@ impl Service {
             max_image_side: config.max_image_side,
             max_request_bytes: (config.max_request_mib << 20) as u32,
         };
-        let ttl = Duration::from_secs(config.session_ttl_seconds);
-        Self { engine, registry: Registry::new(config.max_sessions), limits, ttl, stop }
+        let kept = Limits { sessions: config.max_sessions, kept_bytes: config.max_kept_mib << 20 };
+        Self {
+            engine,
+            catalogue: Catalogue::new(models),
+            registry: Registry::new(kept),
+            handles: Opened::default(),
+            limits,
+            kept,
+            ttl: Duration::from_secs(config.session_ttl_seconds),
+            checkpoints: config.checkpoints(),
+            changing: tokio::sync::Mutex::new(()),
+            stop,
+        }
     }
 
     /// Cancelled when the server goes down.
@@ -64,122 +113,10 @@ impl Service {
         &self.limits
     }
 
-    /// The open sessions.
-    pub fn registry(&self) -> &Registry {
-        &self.registry
-    }
-
-    /// All models.
-    pub fn list_models(&self) -> v1::ListModelsResponse {
-        let mut models: Vec<v1::Model> =
-            self.engine.models().iter().map(|model| self.describe(model)).collect();
-        models.sort_by(|a, b| a.name.cmp(&b.name));
-        v1::ListModelsResponse { models }
-    }
-
-    /// One model.
-    ///
-    /// # Errors
-    /// If it is not served.
-    pub fn get_model(&self, request: &v1::GetModelRequest) -> Result<v1::GetModelResponse, Error> {
-        let model = self.describe(self.model(&request.model)?);
-        Ok(v1::GetModelResponse { model: Some(model) })
-    }
-
-    /// Opens a session.
-    ///
-    /// # Errors
-    /// If the request is wrong, or there are too many.
-    pub fn create_session(
-        &self,
-        request: v1::CreateSessionRequest,
-    ) -> Result<v1::CreateSessionResponse, Error> {
-        let model = self.model(&request.model)?;
-        let label = request.label.chars().count();
-        let ttl = request.ttl.map(Duration::try_from);
-        let ttl = match ttl {
-            None => Some(self.ttl),
-            Some(ttl) => ttl.ok().filter(|ttl| !ttl.is_zero() && *ttl <= self.ttl),
-        };
-        let given = request.ttl.map(|ttl| format!("{} s", ttl.seconds)).unwrap_or_default();
-        let longest = format!("more than 0 and at most {} s", self.ttl.as_secs());
-        fields::all(vec![
-            fields::unless(label <= LABEL, "label", format!("{label} characters"), "at most 128"),
-            fields::unless(ttl.is_some(), "ttl", given, longest),
-        ])?;
-        if request.keep_steps > 0 {
-            return Err(Error::Unimplemented { what: "keeping steps (keep_steps)" });
-        }
-        if request.keep_frames > 0 {
-            return Err(Error::Unimplemented { what: "keeping frames (keep_frames)" });
-        }
-        let opened = NewSession {
-            label: request.label,
-            model: model.id,
-            sample: fields::samples(request.mode, "mode")?,
-            seed: request.seed.unwrap_or_else(fields::random_seed),
-            ttl: ttl.unwrap_or(self.ttl),
-            state: Arc::clone(&model.initial),
-        };
-        let session = self.registry.create(opened, Instant::now())?;
-        tracing::info!(session = %session.id, model = model.spec.name, "session opened");
-        Ok(v1::CreateSessionResponse { session: Some(self.tell(&session)) })
-    }
-
-    /// Tells about a session.
-    ///
-    /// # Errors
-    /// If there is none.
-    pub fn get_session(
-        &self,
-        request: &v1::GetSessionRequest,
-    ) -> Result<v1::GetSessionResponse, Error> {
-        let session = self.session(&request.session_id)?;
-        Ok(v1::GetSessionResponse { session: Some(self.tell(&session)) })
-    }
-
-    /// Tells about sessions, page by page.
-    ///
-    /// # Errors
-    /// If the page is not one.
-    pub fn list_sessions(
-        &self,
-        request: &v1::ListSessionsRequest,
-    ) -> Result<v1::ListSessionsResponse, Error> {
-        let size = request.page_size.unwrap_or(100);
-        if !(1..=1000).contains(&size) {
-            return Err(Error::invalid("page_size", size, "1 to 1000"));
-        }
-        let token = request.page_token.as_str();
-        let after = if token.is_empty() { None } else { Some(token.parse::<SessionId>()) };
-        let Ok(after) = after.transpose() else {
-            let expected = "next_page_token of a previous page";
-            return Err(Error::invalid("page_token", format!("{token:.64?}"), expected));
-        };
-        let matches =
-            |session: &Session| request.label.is_empty() || session.opened.label == request.label;
-        // One more than asked for tells whether there is another page.
-        let mut page = self.registry.list(after, size as usize + 1, Instant::now(), matches);
-        let more = page.len() > size as usize;
-        page.truncate(size as usize);
-        let last = page.last().filter(|_| more).map(|session| session.id.to_string());
-        Ok(v1::ListSessionsResponse {
-            sessions: page.iter().map(|session| self.tell(session)).collect(),
-            next_page_token: last.unwrap_or_default(),
-        })
-    }
-
-    /// Closes a session.
-    ///
-    /// # Errors
-    /// If there is none.
-    pub fn delete_session(
-        &self,
-        request: &v1::DeleteSessionRequest,
-    ) -> Result<v1::DeleteSessionResponse, Error> {
-        self.registry.delete(&request.session_id, Instant::now())?;
-        tracing::info!(session = request.session_id, "session closed");
-        Ok(v1::DeleteSessionResponse {})
+    /// Closes what has expired; returns how many sessions are left, and their bytes.
+    pub fn sweep(&self, now: Instant) -> (usize, usize) {
+        self.handles.sweep(now);
+        self.registry.sweep(now)
     }
 
     /// A session, which counts as used.
@@ -188,79 +125,6 @@ impl Service {
     /// If there is none.
     pub fn session(&self, id: &str) -> Result<Arc<Session>, Error> {
         self.registry.get(id, Instant::now())
-    }
-
-    /// A model by name; without a name the only one.
-    fn model(&self, name: &str) -> Result<&ModelEntry, Error> {
-        let models = self.engine.models();
-        if let ([model], true) = (models, name.is_empty()) {
-            return Ok(model);
-        }
-        let served = || models.iter().map(|model| model.spec.name.clone()).collect::<Vec<_>>();
-        if name.is_empty() {
-            let expected = format!("one of {}", served().join(", "));
-            return Err(Error::invalid("model", "empty", expected));
-        }
-        let model = models.iter().find(|model| model.spec.name == name);
-        model.ok_or_else(|| {
-            let name = name.chars().take(128).collect();
-            Error::UnknownModel { name, served: served() }
-        })
-    }
-
-    fn describe(&self, model: &ModelEntry) -> v1::Model {
-        let spec = &model.spec;
-        let action = |action: &gatsbi_models::world_model::ActionDimension| v1::ActionDimension {
-            name: action.name.clone(),
-            unit: action.unit.clone(),
-            offset: action.offset,
-            scale: action.scale,
-        };
-        let preprocess = match spec.preprocess {
-            Preprocess::Stretch => v1::Preprocess::Stretch,
-            Preprocess::CentreCrop => v1::Preprocess::CentreCrop,
-        };
-        v1::Model {
-            name: spec.name.clone(),
-            hash: spec.hash.clone(),
-            image_size: spec.image_size as u32,
-            preprocess: preprocess.into(),
-            frame_period_seconds: spec.frame_period,
-            actions: spec.actions.iter().map(action).collect(),
-            slots: spec.slots as u32,
-            agent_slot: spec.agent_slot.map(|slot| slot as u32),
-            max_objects: spec.max_objects as u32,
-            keypoints: spec.keypoints.map(|keypoints| keypoints as u32),
-            latents: spec.latents as u32,
-            trained_steps: spec.trained_steps,
-            provenance: spec.provenance.clone(),
-            card: model.card.clone(),
-            state_bytes: model.row_bytes as u32,
-            device: model.device.clone(),
-            limits: Some(self.limits),
-        }
-    }
-
-    fn tell(&self, session: &Session) -> v1::Session {
-        let spec = &self.engine.model(session.opened.model).spec;
-        let mode = if session.opened.sample { v1::Mode::Sample } else { v1::Mode::Mean };
-        let used_at = SystemTime::now() - session.used().elapsed();
-        v1::Session {
-            id: session.id.to_string(),
-            label: session.opened.label.clone(),
-            model: spec.name.clone(),
-            model_hash: spec.hash.clone(),
-            next_step: session.position().next_step,
-            mode: mode.into(),
-            seed: session.opened.seed,
-            created_at: Some(session.created_at.into()),
-            used_at: Some(used_at.into()),
-            expires_at: Some((used_at + session.opened.ttl).into()),
-            bytes: session.bytes() as u64,
-            keep_steps: 0,
-            keep_frames: 0,
-            oldest_step: None,
-        }
     }
 }
 

@@ -34,6 +34,7 @@ const BATCH_FILL: &str = "gatsbi_batch_fill_ratio";
 const STEP_SECONDS: &str = "gatsbi_step_duration_seconds";
 const FAILURES: &str = "gatsbi_model_failures_total";
 const GIVEN_UP: &str = "gatsbi_given_up_total";
+const IMAGES_SKIPPED: &str = "gatsbi_images_skipped_total";
 const SESSIONS: &str = "gatsbi_sessions";
 const SESSION_BYTES: &str = "gatsbi_session_bytes";
 const QUEUE_SECONDS: &str = "gatsbi_queue_duration_seconds";
@@ -79,6 +80,11 @@ const METRICS: &[Metric] = &[
     Metric {
         name: GIVEN_UP,
         what: "Requests whose client went away before they were computed, by model",
+        kind: MetricKind::Counter,
+    },
+    Metric {
+        name: IMAGES_SKIPPED,
+        what: "Images passed over for newer ones",
         kind: MetricKind::Counter,
     },
     Metric { name: SESSIONS, what: "Open sessions", kind: MetricKind::Gauge },
@@ -154,6 +160,11 @@ pub fn waited(kind: Kind, queue: Duration) {
     histogram!(QUEUE_SECONDS, "kind" => kind.label()).record(queue);
 }
 
+/// An image was passed over for a newer one.
+pub fn image_skipped() {
+    counter!(IMAGES_SKIPPED).increment(1);
+}
+
 /// Sessions were opened or closed.
 pub fn sessions(count: usize, bytes: usize) {
     gauge!(SESSIONS).set(count as f64);
@@ -192,7 +203,11 @@ impl Request {
     /// There is an error instead of an answer.
     pub fn failed(mut self, error: &Error) {
         let reason = problem::entry(error).reason;
-        if let Error::Overloaded { .. } | Error::TooManySessions { .. } = error {
+        if let Error::Overloaded { .. }
+        | Error::TooSlow { .. }
+        | Error::TooManySessions { .. }
+        | Error::TooMuchKept { .. } = error
+        {
             counter!(REFUSALS, "reason" => reason).increment(1);
         }
         tracing::debug!(method = self.method, reason, %error, "refused");

@@ -12,6 +12,7 @@ use gatsbi_models::{
     config::presets,
     world_model::{ActionDimension, Preprocess},
 };
+use serde_json::{Value as Json, json};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
 
@@ -84,6 +85,81 @@ fn it_serves_until_it_is_told_to_end() {
     server.stderr.take().unwrap().read_to_string(&mut log).unwrap();
     assert!(ended.success(), "{ended}: {log}");
     assert!(log.contains("shutting down") && !log.contains("ERROR"), "{log}");
+}
+
+/// A running program, ended by its id.
+struct Program(std::process::Child, String);
+
+impl Program {
+    fn start(checkpoint: &std::path::Path) -> Self {
+        let any = "127.0.0.1:0";
+        let mut child = Command::new(PROGRAM)
+            .args(["--grpc-listen", any, "--http-listen", any, "--admin-listen", any])
+            .args(["--log", "warn", "--checkpoint"])
+            .arg(checkpoint)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
+        let start = line.find("http=").unwrap() + 5;
+        let http = line[start..].split_whitespace().next().unwrap().to_owned();
+        Self(child, http)
+    }
+
+    /// Calls the REST API with JSON.
+    fn call(&self, method: reqwest::Method, path: &str, body: &Json) -> Json {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let url = format!("http://{}{path}", self.1);
+            let request = reqwest::Client::new().request(method, url).json(body);
+            let response = request.send().await.unwrap();
+            assert!(response.status().is_success(), "{path}: {}", response.status());
+            response.json().await.unwrap()
+        })
+    }
+
+    fn observe(&self, session: &str, step: u64) -> Json {
+        let values: Vec<f32> = (0..64 * 64 * 3).map(|i| (i as f32 * 0.37).sin().abs()).collect();
+        let pixels = json!({ "dtype": "DATA_TYPE_F32", "shape": [64, 64, 3], "values": values });
+        let action = vec![0.1 * step as f32; 7];
+        let observation = json!({ "step": step, "image": { "pixels": pixels }, "action": action });
+        let outputs = json!({ "outputs": ["OUTPUT_LATENTS", "OUTPUT_OBJECTS", "OUTPUT_FRAME"] });
+        let body = json!({ "observation": observation, "outputs": outputs });
+        let path = format!("/v1/sessions/{session}/observations");
+        let mut answer = self.call(reqwest::Method::POST, &path, &body)["belief"].take();
+        assert!(answer["outputs"].as_array().is_some_and(|outputs| outputs.len() == 2));
+        for own in ["session_id", "timing"] {
+            answer[own].take();
+        }
+        answer
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().ok();
+    }
+}
+
+#[test]
+fn a_session_moves_from_one_process_to_another() {
+    let folder = tempfile::tempdir().unwrap();
+    let checkpoint = checkpoint(folder.path());
+    let (here, there) = (Program::start(&checkpoint), Program::start(&checkpoint));
+    let opened = here.call(reqwest::Method::POST, "/v1/sessions", &json!({ "seed": 3 }));
+    let session = opened["session"]["id"].as_str().unwrap();
+    here.observe(session, 0);
+    here.observe(session, 1);
+    let path = format!("/v1/sessions/{session}/snapshot");
+    let snapshot = here.call(reqwest::Method::GET, &path, &json!({}))["snapshot"].take();
+    let moved =
+        there.call(reqwest::Method::POST, "/v1/snapshots", &json!({ "snapshot": snapshot }));
+    let moved = moved["session"]["id"].as_str().unwrap();
+    for step in 2..4 {
+        assert_eq!(there.observe(moved, step), here.observe(session, step), "step {step}");
+    }
 }
 
 #[test]

@@ -2,9 +2,12 @@
 
 #![expect(clippy::print_stdout, reason = "a command-line program speaks to people")]
 
-use std::path::{Path, PathBuf};
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, bail, ensure};
 use clap::{Parser, Subcommand};
 use gatsbi_episodes::Dataset;
 use gatsbi_models::{
@@ -50,9 +53,9 @@ enum Command {
     },
     /// Train a checkpoint by a recipe.
     Train {
-        /// Recipe file.
+        /// Recipe: a file, or roll, push1, push2, bair, balls or tiny.
         #[arg(long)]
-        recipe: PathBuf,
+        recipe: String,
         /// Data set.
         #[arg(long)]
         episodes: PathBuf,
@@ -68,6 +71,9 @@ enum Command {
         /// Checkpoint whose weights to start from.
         #[arg(long)]
         from: Option<PathBuf>,
+        /// Where to train: cpu, or cuda:N.
+        #[arg(long, default_value = "cpu", value_parser = device)]
+        device: Device,
     },
     /// Measure a checkpoint.
     Eval {
@@ -102,14 +108,14 @@ fn main() -> anyhow::Result<()> {
                 .context("the checkpoint was not written")?;
             println!("{} (untrained, seed {seed})", out.display());
         }
-        Command::Train { recipe, episodes, range, seed, out, from } => {
+        Command::Train { recipe, episodes, range, seed, out, from, device } => {
             tch::set_num_threads(1);
-            let recipe: Recipe = toml::from_str(&fs_err::read_to_string(recipe)?)?;
+            let recipe = Recipe::load(&recipe)?;
             let dataset = Dataset::open(&episodes)?;
-            let range = range.map_or(0..dataset.len(), |range| range[0]..range[1]);
+            let range = episodes_in(&dataset, range)?;
             let clips = Clips::read(&dataset, range.clone())?;
             let data = format!("{} episodes {}..{}", dataset.info().name, range.start, range.end);
-            let mut trainer = Trainer::open(recipe, &clips, &data, seed, &out, Device::Cpu)?;
+            let mut trainer = Trainer::open(recipe, &clips, &data, seed, &out, device)?;
             if let Some(from) = from {
                 trainer.start_from(&from)?;
             }
@@ -123,6 +129,28 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
+fn device(text: &str) -> Result<Device, String> {
+    match (text, text.strip_prefix("cuda:").map(str::parse)) {
+        ("cpu", _) => Ok(Device::Cpu),
+        (_, Some(Ok(index))) if tch::Cuda::is_available() => Ok(Device::Cuda(index)),
+        (_, Some(Ok(_))) => Err("this libtorch sees no CUDA device".to_owned()),
+        _ => Err("expected cpu or cuda:N".to_owned()),
+    }
+}
+
+/// The asked range of episodes, all without one.
+fn episodes_in(dataset: &Dataset, range: Option<Vec<usize>>) -> anyhow::Result<Range<usize>> {
+    let range = range.map_or(0..dataset.len(), |range| range[0]..range[1]);
+    ensure!(
+        !range.is_empty() && range.end <= dataset.len(),
+        "there are no episodes {} up to {}, the data set has {}",
+        range.start,
+        range.end,
+        dataset.len()
+    );
+    Ok(range)
+}
+
 fn evaluate(
     checkpoint: &Path,
     episodes: &Path,
@@ -132,7 +160,7 @@ fn evaluate(
 ) -> anyhow::Result<()> {
     let world = GatsbiWorld::load(checkpoint, Device::Cpu)?;
     let dataset = Dataset::open(episodes)?;
-    let range = range.map_or(0..dataset.len(), |range| range[0]..range[1]);
+    let range = episodes_in(&dataset, range)?;
     let bar = ProgressBar::new(range.len() as u64);
     let report = report(&world, &dataset, range.clone(), HORIZON, |done| bar.inc(done as u64))?;
     bar.finish_and_clear();

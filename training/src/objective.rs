@@ -15,7 +15,7 @@ use tch::{Device, Kind, Tensor};
 
 use crate::{
     clips::Batch,
-    recipe::{KeypointRecipe, ObjectRecipe, Recipe},
+    recipe::{KeypointRecipe, ObjectRecipe, Ramp, Recipe, RegressionRecipe},
 };
 
 /// Where a run is: everything random about a step is a function of this.
@@ -198,26 +198,55 @@ fn add_scene(
         if !alone {
             add_mixture(terms, recipe, &seen.mixture, frame, &first, moment.step);
         }
-        if let (false, Some(slot)) = (alone, model.agent_slot()) {
-            let agent = seen.mixture.log_masks.select(1, slot).exp();
-            let motion = loss::keypoint_regression(&batch.motion[t], &agent);
-            terms.add("to_motion", motion, recipe.regression.motion.at(moment.step));
-            if let Some(gamma) = gamma {
-                let keypoints = loss::keypoint_regression(&gamma[t], &agent);
-                terms.add("to_keypoints", keypoints, recipe.regression.keypoints.at(moment.step));
-            }
+        let rendering = objects.map(|_| model.render(&state));
+        let maps = Maps {
+            gamma: gamma.map(|gamma| &gamma[t]),
+            motion: &batch.motion[t],
+            foreground: &batch.foreground[t],
+        };
+        let agent = model.agent_slot().map(|slot| seen.mixture.log_masks.select(1, slot).exp());
+        let alpha = rendering.as_ref().map(|rendering| &rendering.alpha);
+        add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
+        if let (Some(objects), Some(rendering)) = (objects, &rendering) {
+            add_objects(terms, model, objects, rendering, &seen, frame, &first, moment.step);
         }
-        if let Some(objects) = objects {
-            let rendering = model.render(&state);
-            let rest = match model.agent_slot() {
-                Some(slot) => 1.0 - seen.mixture.log_masks.select(1, slot).exp().detach(),
-                None => batch.foreground[t].ones_like(),
-            };
-            let target = &batch.foreground[t] * rest;
-            let to_objects = loss::keypoint_regression(&target, &rendering.alpha);
-            terms.add("to_objects", to_objects, recipe.regression.objects.at(moment.step));
-            add_objects(terms, model, objects, &rendering, &seen, frame, &first, moment.step);
+    }
+}
+
+/// Maps of a frame that masks are led to, `[B, 1, H, W]` in [0, 1].
+struct Maps<'a> {
+    gamma: Option<&'a Tensor>,
+    motion: &'a Tensor,
+    foreground: &'a Tensor,
+}
+
+/// Leads the agent's mask and the objects' alpha. They share the foreground: each is led to what the other
+/// leaves, and does not push the other.
+fn add_regression(
+    terms: &mut Terms,
+    recipe: &RegressionRecipe,
+    maps: &Maps<'_>,
+    agent: Option<&Tensor>,
+    alpha: Option<&Tensor>,
+    step: u64,
+) {
+    let rest = |other: Option<&Tensor>| match other {
+        Some(mask) => maps.foreground * (1.0 - mask.detach()),
+        None => maps.foreground.shallow_clone(),
+    };
+    if let Some(agent) = agent.filter(|agent| agent.requires_grad()) {
+        let mut lead = |name, map: &Tensor, weight: &Ramp| {
+            terms.add(name, loss::keypoint_regression(map, agent), weight.at(step));
+        };
+        if let Some(gamma) = maps.gamma {
+            lead("to_keypoints", gamma, &recipe.keypoints);
         }
+        lead("to_motion", maps.motion, &recipe.motion);
+        lead("to_foreground", &rest(alpha), &recipe.foreground);
+    }
+    if let Some(alpha) = alpha {
+        let to_objects = loss::keypoint_regression(&rest(agent), alpha);
+        terms.add("to_objects", to_objects, recipe.objects.at(step));
     }
 }
 

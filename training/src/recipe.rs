@@ -1,7 +1,22 @@
 //! A recipe: everything that decides a training run but the data, as one TOML file.
+//!
+//! Those of the paper's data sets and of `tiny` are in `training/recipes` and known by their names.
 
+use std::path::Path;
+
+use anyhow::{Context as _, ensure};
 use gatsbi_models::gatsbi::keypoint::KeypointLearningConfig;
 use serde::{Deserialize, Serialize};
+
+/// Recipes that are known by name.
+const NAMED: [(&str, &str); 6] = [
+    ("roll", include_str!("../recipes/roll.toml")),
+    ("push1", include_str!("../recipes/push1.toml")),
+    ("push2", include_str!("../recipes/push2.toml")),
+    ("bair", include_str!("../recipes/bair.toml")),
+    ("balls", include_str!("../recipes/balls.toml")),
+    ("tiny", include_str!("../recipes/tiny.toml")),
+];
 
 /// How a model is trained.
 #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
@@ -38,6 +53,48 @@ pub struct Recipe {
 }
 
 impl Recipe {
+    /// The recipe of that name, or in that file.
+    ///
+    /// # Errors
+    /// If there is none, or it cannot be used.
+    pub fn load(name_or_file: &str) -> anyhow::Result<Self> {
+        if let Some((name, text)) = NAMED.iter().find(|(name, _)| *name == name_or_file) {
+            return Self::parse(text).with_context(|| format!("recipe {name}"));
+        }
+        let names = NAMED.map(|(name, _)| name).join(", ");
+        let text = fs_err::read_to_string(Path::new(name_or_file))
+            .with_context(|| format!("a recipe is a file or one of {names}"))?;
+        Self::parse(&text).with_context(|| format!("recipe {name_or_file}"))
+    }
+
+    fn parse(text: &str) -> anyhow::Result<Self> {
+        let recipe: Self = toml::from_str(text)?;
+        ensure!(recipe.steps > 0, "steps is 0, expected at least 1");
+        ensure!(recipe.batch > 0, "batch is {}, expected at least 1", recipe.batch);
+        for (field, staircase) in
+            [("length", &recipe.length), ("learning_rate", &recipe.learning_rate)]
+        {
+            ensure!(
+                staircase.0.first().is_some_and(|(step, _)| *step == 0),
+                "{field} does not begin with step 0"
+            );
+            ensure!(
+                staircase.0.is_sorted_by(|(a, _), (b, _)| a < b),
+                "the steps of {field} do not increase"
+            );
+            ensure!(
+                staircase.0.iter().all(|(_, value)| *value > 0.0),
+                "{field} has a value that is not positive"
+            );
+        }
+        Ok(recipe)
+    }
+
+    /// The longest sequences.
+    pub fn longest(&self) -> u64 {
+        self.length.0.iter().map(|(_, length)| *length as u64).max().unwrap_or(0)
+    }
+
     /// Whether nothing but the objects learns at `step`.
     pub fn objects_alone(&self, step: u64) -> bool {
         self.objects
@@ -149,8 +206,11 @@ pub struct RegressionRecipe {
     /// The agent's mask onto the motion map: what differs both from the data's and from the episode's median. It
     /// leads where keypoints learn too slowly; it contains moving objects too.
     pub motion: Ramp,
-    /// The objects' alpha onto what differs from the data's median and is not the agent's. It leads the boxes to
-    /// objects before glimpses can be drawn well enough to be worth their place.
+    /// The agent's mask onto the foreground map, what differs from the data's median, without the objects' alpha.
+    /// It knows the agent better than motion does as soon as objects are known.
+    pub foreground: Ramp,
+    /// The objects' alpha onto the foreground map without the agent's mask. It leads the boxes to objects before
+    /// glimpses can be drawn well enough to be worth their place.
     pub objects: Ramp,
 }
 
@@ -192,5 +252,51 @@ impl Staircase {
     pub fn at(&self, step: u64) -> f64 {
         let after = self.0.partition_point(|(at, _)| *at <= step);
         self.0[after.saturating_sub(1)].1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gatsbi_models::config::presets;
+
+    use super::*;
+
+    #[test]
+    fn the_named_recipes_can_be_used() {
+        for (name, _) in NAMED {
+            let recipe = Recipe::load(name).unwrap();
+            assert!(presets::preset(&recipe.model).is_some(), "{name}");
+        }
+    }
+
+    #[test]
+    fn numbers_follow_their_steps() {
+        let ramp = Ramp::Points(vec![(10, 1.0), (20, 2.0)]);
+        for (step, value) in [(0, 1.0), (10, 1.0), (15, 1.5), (20, 2.0), (99, 2.0)] {
+            assert!((ramp.at(step) - value).abs() < 1e-12, "{step}");
+        }
+        let stairs = Staircase(vec![(0, 5.0), (20, 7.0)]);
+        for (step, value) in [(0, 5.0), (19, 5.0), (20, 7.0)] {
+            assert!((stairs.at(step) - value).abs() < 1e-12, "{step}");
+        }
+    }
+
+    #[test]
+    fn a_recipe_that_cannot_be_used_is_refused() {
+        let tiny = NAMED[5].1;
+        let wrong = [
+            (tiny.replace("batch = ", "batch = 0 # "), "batch is 0"),
+            (
+                tiny.replace("length = ", "length = [[5, 4]] # "),
+                "length does not begin with step 0",
+            ),
+            (tiny.replace("clip = ", "clap = "), "unknown field `clap`"),
+        ];
+        for (text, expected) in wrong {
+            let error = format!("{:#}", Recipe::parse(&text).unwrap_err());
+            assert!(error.contains(expected), "{error}");
+        }
+        let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
+        assert!(error.contains("roll, push1, push2, bair, balls, tiny"), "{error}");
     }
 }

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use gatsbi_models::{
     checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
-    config::presets,
+    config::{GatsbiConfig, presets},
     gatsbi::{
         keypoint::KeypointLearning,
         model::{GradientStops, Observing},
@@ -69,7 +69,16 @@ impl Trainer {
         fs_err::create_dir_all(folder)?;
         let mut model = presets::preset(&recipe.model)
             .with_context(|| format!("there is no architecture preset {}", recipe.model))?;
+        ensure!(
+            recipe.longest() <= clips.shortest() as u64,
+            "the recipe's sequences have up to {} frames, the shortest episode {}",
+            recipe.longest(),
+            clips.shortest()
+        );
         model.action.dim = clips.actions.len() as i64;
+        if let Some(bounds) = recipe.objects.as_ref().and_then(|objects| objects.scale_bounds) {
+            model.tracking.scale_bounds = Some(bounds);
+        }
         let mut header = untrained::header(&recipe.name, model, clips.actions.clone(), seed);
         header.frame_period = Some(clips.frame_period);
         let checkpoint = Checkpoint::untrained(header, device);
@@ -112,9 +121,9 @@ impl Trainer {
     pub fn start_from(&mut self, path: &Path) -> anyhow::Result<()> {
         if self.progress.step == 0 {
             let loaded = Checkpoint::load(path, self.device)?;
-            let same = loaded.header.model == self.checkpoint.header.model;
-            ensure!(same, "{} has another architecture", path.display());
             let header = self.checkpoint.header.clone();
+            let theirs = GatsbiConfig { tracking: header.model.tracking, ..loaded.header.model };
+            ensure!(theirs == header.model, "{} has another architecture", path.display());
             self.checkpoint = Checkpoint { header, ..loaded };
             self.recipe.prefit = None;
         }

@@ -47,6 +47,7 @@ scale_mean = -2.0
 [regression]
 keypoints = 1.0
 motion = 1.0
+foreground = 1.0
 objects = 1.0
 
 [keypoints]

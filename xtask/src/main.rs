@@ -1,12 +1,18 @@
 //! The project's automation: `cargo xtask <command>`, the same on a laptop and in `.ci/run`.
 //!
 //! It must build before libtorch is there and is the first thing a newcomer waits for, so it depends on
-//! none of our crates and on few others. Read on in [`setup`], which provides libtorch, and [`cargo`],
-//! which runs the checks.
+//! none of our crates and on few others. Read on in [`setup`], which provides libtorch, [`cargo`], which runs
+//! the checks and builds, and [`demo`], which shows the whole; [`twin`] and [`mod@bench`] hold the model against a second
+//! one in PyTorch. [`process`] looks after programs that run beside it.
 
+mod bench;
 mod cargo;
+mod demo;
 mod libtorch;
+mod mujoco;
+mod process;
 mod setup;
+mod twin;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -32,6 +38,11 @@ enum Command {
         #[arg(long)]
         cuda: bool,
     },
+    /// Serve recorded robot episodes from the bundled model, and show what it sees and imagines
+    ///
+    /// Sets up and builds what is missing, starts the server on free ports of the loopback, runs `gatsbi demo` against
+    /// it, and stops it again. Numbers are printed, pictures left in demo-out.
+    Demo(demo::Arguments),
     /// Set up what is missing and run every test of the workspace, doctests included
     Test {
         /// Passed to the test binaries: a name to filter by, --nocapture, --test-threads=1
@@ -40,6 +51,19 @@ enum Command {
     },
     /// Check formatting, clippy, the documentation and (where cargo-deny is installed) the dependencies
     Lint,
+    /// Compare the Rust model with its twin in PyTorch at full size; prints the table of differences
+    ///
+    /// Makes .venv-twin with torch 2.11.0 from where pip is set to find it, unless it is there. Untrained checkpoints are
+    /// recorded with the twin on the spot, in about four minutes on two cores.
+    Twin {
+        /// Sizes to compare: tiny, push1, bair, balls; all by default
+        #[arg(value_name = "PRESET")]
+        presets: Vec<String>,
+    },
+    /// Measure steps of the Rust model beside its twin in PyTorch, on one thread each
+    ///
+    /// Both have the same weights and take turns, so that what else the machine does hits both; rely on the ratios.
+    Bench(bench::Arguments),
     /// Format the sources
     Fmt,
 }
@@ -61,8 +85,11 @@ fn run(command: Command) -> Result<()> {
         Command::Setup { cpu: true, .. } => setup::setup(root, Some(Variant::Cpu)),
         Command::Setup { cuda: true, .. } => setup::setup(root, Some(Variant::Cuda)),
         Command::Setup { .. } => setup::setup(root, None),
+        Command::Demo(arguments) => demo::demo(root, &arguments),
         Command::Test { args } => cargo::test(root, &args),
         Command::Lint => cargo::lint(root),
+        Command::Twin { presets } => twin::agree(root, &presets),
+        Command::Bench(arguments) => bench::bench(root, &arguments),
         Command::Fmt => cargo::fmt(root),
     }
 }

@@ -1,4 +1,5 @@
-//! Provides libtorch in a cache shared by all checkouts, and points the repository's `.libtorch` at it.
+//! Provides libtorch in a cache shared by all checkouts, and points the repository's `.libtorch` at it; libmujoco
+//! comes the same way, see [`crate::mujoco`].
 //!
 //! Which files of which wheels make up a libtorch is written in `libtorch/cpu.json` and `libtorch/cuda.json`,
 //! the recipes; `libtorch/fetch.py` downloads and unpacks them. Here they become a folder that torch-sys
@@ -22,6 +23,7 @@ use fs_err as fs;
 
 use crate::cargo;
 use crate::libtorch::{self, LINK, VERSION};
+use crate::mujoco;
 
 const FETCH: &str = include_str!("../libtorch/fetch.py");
 const RECIPE: &str = "recipe.json";
@@ -61,6 +63,7 @@ impl Variant {
 
 /// Provides the wanted libtorch, or the one that suits this machine, unless the user brought one.
 pub(crate) fn setup(root: &Path, wanted: Option<Variant>) -> Result<()> {
+    mujoco::set_up(root)?;
     if let Some(folder) = libtorch::of_the_user(root)? {
         eprintln!("libtorch {VERSION} of your environment is used: {}", folder.display());
         return Ok(());
@@ -76,6 +79,7 @@ pub(crate) fn setup(root: &Path, wanted: Option<Variant>) -> Result<()> {
 
 /// Sets up unless a libtorch is there already: the user's own, or either variant of ours.
 pub(crate) fn ensure_set_up(root: &Path) -> Result<()> {
+    mujoco::set_up(root)?;
     let linked = fs::read_link(root.join(LINK)).ok();
     let is_complete =
         |folder: &Path| [Variant::Cpu, Variant::Cuda].iter().any(|v| v.is_complete_in(folder));
@@ -143,7 +147,7 @@ fn check_compiler() -> Result<()> {
 }
 
 /// Keeps a second set-up out of the cache until the returned file is dropped.
-fn lock(cache: &Path) -> Result<File> {
+pub(crate) fn lock(cache: &Path) -> Result<File> {
     let path = cache.join("lock");
     let file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
     match file.try_lock() {
@@ -156,7 +160,8 @@ fn lock(cache: &Path) -> Result<File> {
     Ok(file)
 }
 
-fn fetch(recipe: &str, downloads: &Path, target: &Path) -> Result<()> {
+/// Downloads and unpacks what `recipe` lists into `target`.
+pub(crate) fn fetch(recipe: &str, downloads: &Path, target: &Path) -> Result<()> {
     let mut python = Command::new("python3")
         .args(["-", recipe])
         .args([downloads, target])
@@ -174,7 +179,7 @@ fn fetch(recipe: &str, downloads: &Path, target: &Path) -> Result<()> {
     let sentence = String::from_utf8_lossy(&output.stdout);
     match (output.status.success(), sentence.trim()) {
         (true, _) => written.context("python3 did not read its script"),
-        (false, "") => bail!("libtorch could not be fetched (python3: {})", output.status),
+        (false, "") => bail!("the download failed (python3: {})", output.status),
         (false, sentence) => bail!("{sentence}"),
     }
 }
@@ -190,7 +195,7 @@ fn make_libtorch_so(lib: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Points `.libtorch` at `target` in one step.
+/// Points `.libtorch` at `target`.
 fn link(root: &Path, target: &Path) -> Result<()> {
     let link = root.join(LINK);
     let before = fs::read_link(&link).ok();
@@ -201,7 +206,15 @@ fn link(root: &Path, target: &Path) -> Result<()> {
         // Cargo sees the link's name only, and would keep what was built against the other libtorch.
         cargo::clean(root, "torch-sys")?;
     }
-    let fresh = root.join(".libtorch.new");
+    replace_link(&link, target)
+}
+
+/// Points `link` at `target` in one step.
+pub(crate) fn replace_link(link: &Path, target: &Path) -> Result<()> {
+    if fs::read_link(link).is_ok_and(|before| before == target) {
+        return Ok(());
+    }
+    let fresh = link.with_added_extension("new");
     if fresh.is_symlink() {
         fs::remove_file(&fresh)?;
     }
@@ -210,12 +223,13 @@ fn link(root: &Path, target: &Path) -> Result<()> {
     Ok(())
 }
 
-fn cache() -> Result<PathBuf> {
+/// The folder that all checkouts share.
+pub(crate) fn cache() -> Result<PathBuf> {
     let folder = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let cache = folder("GATSBI_CACHE")
         .or_else(|| Some(folder("XDG_CACHE_HOME")?.join("gatsbi")))
         .or_else(|| Some(folder("HOME")?.join(".cache/gatsbi")))
-        .context("there is no home folder to cache libtorch in: set GATSBI_CACHE to a folder")?;
+        .context("there is no home folder to cache libraries in: set GATSBI_CACHE to a folder")?;
     std::path::absolute(&cache).with_context(|| format!("{} is no path", cache.display()))
 }
 

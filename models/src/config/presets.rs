@@ -111,6 +111,8 @@ pub fn tiny() -> GatsbiConfig {
                 channels: vec![32, 16, 8],
                 groups: vec![2, 1, 1],
             },
+            // At 0.8 every fifth box is a second one on a known object; boxes of neighbours do not overlap so far.
+            rejection: Some(0.4),
             ..objects(4, 7)
         },
         tracking: Tracking::serving(),

@@ -1,9 +1,10 @@
 //! What both skins do around a use case: a span, and counting what became of it.
 
+use futures_util::{Stream, StreamExt as _, stream::unfold};
 use gatsbi_proto::v1;
 use tracing::Instrument as _;
 
-use crate::{error::Error, service::imagine::Rollout, telemetry::Request};
+use crate::{error::Error, service::rollout::Rollout, telemetry::Request};
 
 /// Runs a use case that came over `api`.
 pub(super) async fn answer<T>(
@@ -39,6 +40,22 @@ pub(super) async fn rollout(
     }
 }
 
+/// A stream that came over `api`, counted when it has ended.
+pub(super) fn stream<S: Stream>(
+    api: &'static str,
+    method: &'static str,
+    answers: S,
+) -> impl Stream<Item = S::Item> {
+    let state = (Box::pin(answers), Request::new(api, method));
+    unfold(state, |(mut answers, request)| async move {
+        let Some(answer) = answers.next().await else {
+            request.answered();
+            return None;
+        };
+        Some((answer, (answers, request)))
+    })
+}
+
 impl CountedRollout {
     /// The next chunk; nothing after the last one or an error.
     pub(super) async fn next(&mut self) -> Option<Result<v1::ImagineResponse, Error>> {
@@ -48,6 +65,6 @@ impl CountedRollout {
             (_, Some(request)) => request.answered(),
             (_, None) => {}
         }
-        chunk
+        Some(chunk?.map(|chunk| v1::ImagineResponse { chunk: Some(chunk) }))
     }
 }

@@ -1,24 +1,19 @@
-//! The gRPC skin: one line per unary method, and the two streams.
+//! The gRPC skin: one line per unary method, and the streams.
 
-use std::{
-    pin::Pin,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+mod control_loop;
 
-use futures_util::{Stream, stream::unfold};
+use std::{pin::Pin, sync::Arc};
+
+use futures_util::{Stream, StreamExt as _, stream::unfold};
 use gatsbi_proto::v1::{
     self, imagination_service_server::ImaginationService, model_service_server::ModelService,
-    observe_stream_response, planning_service_server::PlanningService,
-    session_service_server::SessionService,
+    planning_service_server::PlanningService, session_service_server::SessionService,
 };
-use tonic::{Request, Response, Status, Streaming, async_trait, metadata::MetadataMap};
+use tonic::{Request, Response, Status, Streaming, async_trait};
 
-use super::{counted, problem};
-use crate::{
-    error::{Error, FieldProblem},
-    service::Service,
-};
+use self::control_loop::ControlLoop;
+use super::{call, counted, problem};
+use crate::{error::Error, service::Service};
 
 /// Answers of a stream.
 type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
@@ -78,8 +73,8 @@ impl SessionService for Grpc {
         &self,
         request: Request<v1::ObserveRequest>,
     ) -> Result<Response<v1::ObserveResponse>, Status> {
-        let deadline = deadline(request.metadata());
-        unary("Observe", self.0.observe(request.into_inner(), deadline)).await
+        let call = call::of(request.metadata().as_ref());
+        unary("Observe", self.0.observe(request.into_inner(), call)).await
     }
 
     type ObserveStreamStream = Answers<v1::ObserveStreamResponse>;
@@ -88,13 +83,8 @@ impl SessionService for Grpc {
         &self,
         request: Request<Streaming<v1::ObserveStreamRequest>>,
     ) -> Result<Response<Self::ObserveStreamStream>, Status> {
-        let control_loop = ControlLoop {
-            service: Arc::clone(&self.0),
-            observations: request.into_inner(),
-            session_id: String::new(),
-            outputs: None,
-            ended: false,
-        };
+        let call = call::of(request.metadata().as_ref());
+        let control_loop = ControlLoop::new(Arc::clone(&self.0), call, request.into_inner());
         let answers = unfold(control_loop, |mut control_loop| async {
             let answer = control_loop.next().await?;
             Some((answer, control_loop))
@@ -104,30 +94,30 @@ impl SessionService for Grpc {
 
     async fn fork_session(
         &self,
-        _: Request<v1::ForkSessionRequest>,
+        request: Request<v1::ForkSessionRequest>,
     ) -> Result<Response<v1::ForkSessionResponse>, Status> {
-        unimplemented("ForkSession", "forking sessions").await
+        unary("ForkSession", async { self.0.fork_session(request.into_inner()) }).await
     }
 
     async fn rewind_session(
         &self,
-        _: Request<v1::RewindSessionRequest>,
+        request: Request<v1::RewindSessionRequest>,
     ) -> Result<Response<v1::RewindSessionResponse>, Status> {
-        unimplemented("RewindSession", "rewinding sessions").await
+        unary("RewindSession", self.0.rewind_session(request.into_inner())).await
     }
 
     async fn export_session(
         &self,
-        _: Request<v1::ExportSessionRequest>,
+        request: Request<v1::ExportSessionRequest>,
     ) -> Result<Response<v1::ExportSessionResponse>, Status> {
-        unimplemented("ExportSession", "exporting sessions").await
+        unary("ExportSession", async { self.0.export_session(request.get_ref()) }).await
     }
 
     async fn import_session(
         &self,
-        _: Request<v1::ImportSessionRequest>,
+        request: Request<v1::ImportSessionRequest>,
     ) -> Result<Response<v1::ImportSessionResponse>, Status> {
-        unimplemented("ImportSession", "importing sessions").await
+        unary("ImportSession", self.0.import_session(request.into_inner())).await
     }
 }
 
@@ -139,8 +129,8 @@ impl ImaginationService for Grpc {
         &self,
         request: Request<v1::ImagineRequest>,
     ) -> Result<Response<Self::ImagineStream>, Status> {
-        let deadline = deadline(request.metadata());
-        let start = self.0.imagine(request.into_inner(), deadline);
+        let call = call::of(request.metadata().as_ref());
+        let start = self.0.imagine(request.into_inner(), call);
         let rollout = counted::rollout("grpc", start).await;
         let rollout = rollout.map_err(|error| problem::status(&error))?;
         let chunks = unfold(rollout, |mut rollout| async {
@@ -154,30 +144,34 @@ impl ImaginationService for Grpc {
 
     async fn predict_batch(
         &self,
-        _: Request<Streaming<v1::PredictBatchRequest>>,
+        request: Request<Streaming<v1::PredictBatchRequest>>,
     ) -> Result<Response<Self::PredictBatchStream>, Status> {
-        unimplemented("PredictBatch", "batched predictions").await
+        let call = call::of(request.metadata().as_ref());
+        let answers = self.0.predict_batch(request.into_inner(), call);
+        let answers = answers.map(|answer| answer.map(problem::prediction));
+        Ok(Response::new(Box::pin(counted::stream("grpc", "PredictBatch", answers))))
     }
 
     async fn open_handles(
         &self,
-        _: Request<v1::OpenHandlesRequest>,
+        request: Request<v1::OpenHandlesRequest>,
     ) -> Result<Response<v1::OpenHandlesResponse>, Status> {
-        unimplemented("OpenHandles", "handles for policies outside").await
+        unary("OpenHandles", self.0.open_handles(request.into_inner())).await
     }
 
     async fn step_handles(
         &self,
-        _: Request<v1::StepHandlesRequest>,
+        request: Request<v1::StepHandlesRequest>,
     ) -> Result<Response<v1::StepHandlesResponse>, Status> {
-        unimplemented("StepHandles", "handles for policies outside").await
+        let call = call::of(request.metadata().as_ref());
+        unary("StepHandles", self.0.step_handles(request.into_inner(), call)).await
     }
 
     async fn close_handles(
         &self,
-        _: Request<v1::CloseHandlesRequest>,
+        request: Request<v1::CloseHandlesRequest>,
     ) -> Result<Response<v1::CloseHandlesResponse>, Status> {
-        unimplemented("CloseHandles", "handles for policies outside").await
+        unary("CloseHandles", async { self.0.close_handles(request.get_ref()) }).await
     }
 }
 
@@ -212,69 +206,6 @@ impl PlanningService for Grpc {
     }
 }
 
-/// The control loop of one session.
-struct ControlLoop {
-    service: Arc<Service>,
-    observations: Streaming<v1::ObserveStreamRequest>,
-    session_id: String,
-    outputs: Option<v1::OutputSelection>,
-    ended: bool,
-}
-
-impl ControlLoop {
-    /// Waits for an observation and answers it.
-    async fn next(&mut self) -> Option<Result<v1::ObserveStreamResponse, Status>> {
-        if self.ended {
-            return None;
-        }
-        let stop = self.service.stop().clone();
-        let received = tokio::select! {
-            received = self.observations.message() => received,
-            () = stop.cancelled() => Err(problem::status(&Error::ShuttingDown)),
-        };
-        let request = match received {
-            Ok(request) => request?,
-            Err(status) => {
-                self.ended = true;
-                return Some(Err(status));
-            }
-        };
-        let answer = counted::answer("grpc", "ObserveStream", self.observe(request)).await;
-        let answer = match answer {
-            Ok(belief) => observe_stream_response::Result::Belief(belief),
-            // Without its session the loop has nothing to go on with.
-            Err(error @ Error::UnknownSession { .. }) => {
-                self.ended = true;
-                return Some(Err(problem::status(&error)));
-            }
-            Err(error) => observe_stream_response::Result::Problem(problem::message(&error)),
-        };
-        Some(Ok(v1::ObserveStreamResponse { result: Some(answer) }))
-    }
-
-    async fn observe(&mut self, request: v1::ObserveStreamRequest) -> Result<v1::Belief, Error> {
-        let v1::ObserveStreamRequest { session_id, observation, outputs, timeout_millis } = request;
-        if self.session_id.is_empty() {
-            self.session_id = session_id;
-        } else if !session_id.is_empty() && session_id != self.session_id {
-            let expected = format!("empty or {}: a stream is for one session", self.session_id);
-            let problem = FieldProblem::new("session_id", format!("{session_id:.64}"), expected);
-            return Err(Error::InvalidFields(vec![problem]));
-        }
-        if outputs.is_some() {
-            self.outputs = outputs;
-        }
-        let request = v1::ObserveRequest {
-            session_id: self.session_id.clone(),
-            observation,
-            outputs: self.outputs.clone(),
-            timeout_millis,
-        };
-        let answer = self.service.observe(request, None).await?;
-        Ok(answer.belief.unwrap_or_default())
-    }
-}
-
 async fn unary<T>(
     method: &'static str,
     answer: impl Future<Output = Result<T, Error>>,
@@ -288,49 +219,4 @@ pub(super) async fn unimplemented<T>(
     what: &'static str,
 ) -> Result<Response<T>, Status> {
     unary(method, async { Err(Error::Unimplemented { what }) }).await
-}
-
-/// The deadline that a call brings along: up to eight digits and a unit (gRPC over HTTP/2, `grpc-timeout`).
-fn deadline(metadata: &MetadataMap) -> Option<Instant> {
-    let text = metadata.get("grpc-timeout")?.to_str().ok()?;
-    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
-    let number: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
-    let timeout = match unit {
-        "H" => Duration::from_secs(number * 3600),
-        "M" => Duration::from_secs(number * 60),
-        "S" => Duration::from_secs(number),
-        "m" => Duration::from_millis(number),
-        "u" => Duration::from_micros(number),
-        "n" => Duration::from_nanos(number),
-        _ => return None,
-    };
-    Instant::now().checked_add(timeout)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn deadlines_of_calls_are_understood() {
-        let left = |text: &'static str| {
-            let mut metadata = MetadataMap::new();
-            metadata.insert("grpc-timeout", text.parse().unwrap());
-            deadline(&metadata).map(|at| at.duration_since(Instant::now()))
-        };
-        let near = |text, seconds: f64| {
-            let left = left(text).unwrap().as_secs_f64();
-            assert!((seconds - 1.0..=seconds).contains(&left), "{text}: {left}");
-        };
-        near("5S", 5.0);
-        near("2H", 7200.0);
-        near("3M", 180.0);
-        near("2500m", 2.5);
-        near("4000000u", 4.0);
-        assert!(left("10n").is_some());
-        for bad in ["", "5", "S", "5s", "123456789S", "-1S"] {
-            assert_eq!(left(bad), None, "{bad}");
-        }
-        assert_eq!(deadline(&MetadataMap::new()), None);
-    }
 }

@@ -9,12 +9,15 @@ use axum::{
     http::{HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
-use gatsbi_proto::v1;
+use gatsbi_proto::v1::{self, predict_batch_response};
 use serde::Serialize;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-use crate::error::{Error, FieldProblem};
+use crate::{
+    error::{Error, FieldProblem},
+    service::predict::Prediction,
+};
 
 /// The namespace of reasons, in `google.rpc.ErrorInfo`.
 const DOMAIN: &str = "gatsbi";
@@ -47,6 +50,17 @@ pub fn entry(error: &Error) -> Entry {
         }
         Error::UnknownSession { .. } => ("UNKNOWN_SESSION", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownModel { .. } => ("UNKNOWN_MODEL", Code::NotFound, StatusCode::NOT_FOUND),
+        Error::UnknownHandles { .. } => ("UNKNOWN_HANDLES", Code::NotFound, StatusCode::NOT_FOUND),
+        Error::HandlesMoved { .. } => {
+            ("HANDLES_MOVED", Code::FailedPrecondition, StatusCode::CONFLICT)
+        }
+        Error::BadCheckpoint { .. } => {
+            ("BAD_CHECKPOINT", Code::InvalidArgument, StatusCode::BAD_REQUEST)
+        }
+        Error::ModelExists { .. } => ("MODEL_EXISTS", Code::AlreadyExists, StatusCode::CONFLICT),
+        Error::ModelInUse { .. } => {
+            ("MODEL_IN_USE", Code::FailedPrecondition, StatusCode::CONFLICT)
+        }
         Error::UnknownPath { .. } => ("UNKNOWN_PATH", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownMethod { .. } => {
             ("UNKNOWN_METHOD", Code::Unimplemented, StatusCode::METHOD_NOT_ALLOWED)
@@ -56,6 +70,12 @@ pub fn entry(error: &Error) -> Entry {
         Error::SessionMoved { .. } => {
             ("SESSION_MOVED", Code::FailedPrecondition, StatusCode::CONFLICT)
         }
+        Error::StepNotKept { .. } => {
+            ("STEP_NOT_KEPT", Code::FailedPrecondition, StatusCode::CONFLICT)
+        }
+        Error::ForeignSnapshot { .. } => {
+            ("FOREIGN_SNAPSHOT", Code::FailedPrecondition, StatusCode::CONFLICT)
+        }
         Error::NothingObserved => {
             ("NOTHING_OBSERVED", Code::FailedPrecondition, StatusCode::CONFLICT)
         }
@@ -64,6 +84,10 @@ pub fn entry(error: &Error) -> Entry {
         }
         Error::Overloaded { .. } => {
             ("OVERLOADED", Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS)
+        }
+        Error::TooSlow { .. } => ("TOO_SLOW", Code::DeadlineExceeded, StatusCode::GATEWAY_TIMEOUT),
+        Error::TooMuchKept { .. } => {
+            ("TOO_MUCH_KEPT", Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS)
         }
         Error::TooManySessions { .. } => {
             ("TOO_MANY_SESSIONS", Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS)
@@ -76,6 +100,7 @@ pub fn entry(error: &Error) -> Entry {
         }
         Error::ModelFailed => ("MODEL_FAILED", Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
         Error::NotFinite => ("NOT_FINITE", Code::Internal, StatusCode::INTERNAL_SERVER_ERROR),
+        Error::Starting => ("STARTING", Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE),
         Error::ShuttingDown => {
             ("SHUTTING_DOWN", Code::Unavailable, StatusCode::SERVICE_UNAVAILABLE)
         }
@@ -99,6 +124,15 @@ pub fn status(error: &Error) -> Status {
         details.set_retry_info(Some(delay));
     }
     Status::with_error_details(code, error.to_string(), details)
+}
+
+/// A part of the answer to one prediction of many.
+pub fn prediction(prediction: Prediction) -> v1::PredictBatchResponse {
+    let result = match prediction.chunk {
+        Ok(chunk) => predict_batch_response::Result::Chunk(chunk),
+        Err(error) => predict_batch_response::Result::Problem(message(&error)),
+    };
+    v1::PredictBatchResponse { key: prediction.key, result: Some(result) }
 }
 
 /// An error as a message of a stream.
@@ -192,11 +226,23 @@ mod tests {
             Error::TooLarge { limit_bytes: 1024 },
             Error::UnknownSession { id: "7".into() },
             Error::UnknownModel { name: "x".into(), served: vec!["tiny".into()] },
+            Error::UnknownHandles { id: "7".into() },
+            Error::HandlesMoved { step: 3, stepped: 5 },
+            Error::BadCheckpoint { path: "x".into(), reason: "it is no checkpoint".into() },
+            Error::ModelExists { name: "tiny".into() },
+            Error::ModelInUse { name: "tiny".into(), sessions: 3 },
             Error::UnknownPath { path: "/v2".into() },
             Error::UnknownMethod { path: "/v1/models".into(), method: "PUT".into() },
             Error::StepConflict { step: 4 },
             Error::StepGap { step: 9, expected: 5 },
             Error::SessionMoved { at_step: 3, last: 4 },
+            Error::StepNotKept { to_step: 2, oldest: Some(5), last: 9 },
+            Error::StepNotKept { to_step: 2, oldest: None, last: 9 },
+            Error::ForeignSnapshot {
+                field: "snapshot".into(),
+                found: "00ff".into(),
+                expected: "which is not served here".into(),
+            },
             Error::NothingObserved,
             Error::OutputUnavailable {
                 field: "outputs.outputs[0]".into(),
@@ -204,11 +250,18 @@ mod tests {
                 reason: "the model has no detector",
             },
             Error::Overloaded { what: "rows of rollouts wait", retry_after },
+            Error::TooSlow {
+                needs: Duration::from_millis(4200),
+                within: Duration::from_millis(500),
+                retry_after: None,
+            },
+            Error::TooMuchKept { limit_bytes: 1024, retry_after },
             Error::TooManySessions { limit: 2, retry_after },
             Error::DeadlineExceeded,
             Error::Unimplemented { what: "forking" },
             Error::ModelFailed,
             Error::NotFinite,
+            Error::Starting,
             Error::ShuttingDown,
         ]
     }

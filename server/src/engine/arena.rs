@@ -3,6 +3,8 @@
 //! A row enters when it starts, from the belief that its rollout pinned, and stays on the device until it is done.
 //! Which slot belongs to whom is the scheduler's knowledge.
 
+use std::sync::Arc;
+
 use gatsbi_models::state::{State, StateLayout, StateRow};
 use tch::{Device, Kind, Tensor};
 
@@ -24,15 +26,21 @@ impl Arena {
         }
     }
 
-    /// Puts a host row into each of `slots`.
-    pub(super) fn enter(&mut self, slots: &[u32], row: &StateRow) {
-        let one = State::from_rows([row], self.rows.floats.device());
-        let count = slots.len() as i64;
-        let rows = State {
-            floats: one.floats.expand([count, -1], false),
-            ints: one.ints.expand([count, -1], false),
-        };
-        self.put(slots, &rows);
+    /// Puts a host row into each of `slots`. Rows that many share, as the candidates of a rollout do, are brought to
+    /// the device once.
+    pub(super) fn enter(&mut self, slots: &[u32], rows: &[&Arc<StateRow>]) {
+        let mut distinct: Vec<&Arc<StateRow>> = Vec::new();
+        let which = rows.iter().map(|row| {
+            // Sharing rows are neighbours.
+            if !distinct.last().is_some_and(|last| Arc::ptr_eq(last, row)) {
+                distinct.push(row);
+            }
+            distinct.len() as i64 - 1
+        });
+        let which: Vec<i64> = which.collect();
+        let device = self.rows.floats.device();
+        let distinct = State::from_rows(distinct.into_iter().map(AsRef::as_ref), device);
+        self.put(slots, &distinct.gather(&Tensor::from_slice(&which).to_device(device)));
     }
 
     /// The rows in `slots`, in this order; a slot may appear more than once.
@@ -65,8 +73,10 @@ mod tests {
             rows: State::from_rows([&row(0.0), &row(0.0), &row(0.0), &row(0.0)], Device::Cpu),
         };
         arena.put(&[3, 1], &together);
-        arena.enter(&[0, 2], &row(5.0));
-        let taken = arena.take(&[0, 1, 2, 3, 1]).to_rows();
-        assert_eq!(taken, [5.0, 2.0, 5.0, 1.0, 2.0].map(row));
+        let (five, six) = (Arc::new(row(5.0)), Arc::new(row(6.0)));
+        arena.enter(&[0, 2], &[&five, &five]);
+        assert_eq!(arena.take(&[0, 1, 2, 3, 1]).to_rows(), [5.0, 2.0, 5.0, 1.0, 2.0].map(row));
+        arena.enter(&[3, 0, 2], &[&six, &five, &six]);
+        assert_eq!(arena.take(&[0, 1, 2, 3]).to_rows(), [5.0, 2.0, 6.0, 6.0].map(row));
     }
 }

@@ -98,15 +98,27 @@ impl Computed {
         self.state.gather(&Tensor::from_slice(lanes).to_device(self.state.floats.device()))
     }
 
+    /// States of neighbouring lanes, on the host.
+    pub(super) fn states(&self, lanes: &Range<usize>) -> Vec<StateRow> {
+        let (start, length) = (lanes.start as i64, lanes.len() as i64);
+        let part = |rows: &Tensor| rows.narrow(0, start, length);
+        State { floats: part(&self.state.floats), ints: part(&self.state.ints) }.to_rows()
+    }
+
     /// What is wanted of neighbouring lanes.
     pub(super) fn values(&self, lanes: Range<usize>, wanted: Wanted) -> Vec<Value> {
-        self.wanted(wanted)
-            .map(|value| {
-                let row = value.data.len() / self.finite.len();
-                let data = value.data.slice(lanes.start * row..lanes.end * row);
-                Value { data, shape: value.shape.clone(), ..*value }
-            })
-            .collect()
+        self.wanted(wanted).map(|value| self.part(value, &lanes)).collect()
+    }
+
+    /// What is wanted of neighbouring lanes for the spread over samples.
+    pub(super) fn spread(&self, lanes: Range<usize>, wanted: Wanted) -> Vec<Value> {
+        self.in_form(wanted.spread, Form::F32).map(|value| self.part(value, &lanes)).collect()
+    }
+
+    fn part(&self, value: &Value, lanes: &Range<usize>) -> Value {
+        let row = value.data.len() / self.finite.len();
+        let data = value.data.slice(lanes.start * row..lanes.end * row);
+        Value { data, shape: value.shape.clone(), ..*value }
     }
 
     /// What is wanted of one lane, in memory of its own: sessions keep it, and should not keep the batch.
@@ -129,9 +141,13 @@ impl Computed {
     }
 
     fn wanted(&self, wanted: Wanted) -> impl Iterator<Item = &Value> {
-        let values = self.values.iter().filter(move |(form, value)| {
-            *form == wanted.form && wanted.outputs.contains(value.output)
-        });
+        self.in_form(wanted.outputs, wanted.form)
+    }
+
+    fn in_form(&self, outputs: Outputs, form: Form) -> impl Iterator<Item = &Value> {
+        let values = self.values.iter();
+        let values = values
+            .filter(move |(as_form, value)| *as_form == form && outputs.contains(value.output));
         values.map(|(_, value)| value)
     }
 }
@@ -149,7 +165,8 @@ fn step(world: &dyn WorldModel, batch: Batch) -> Computed {
     let started = Instant::now();
     let device = world.device();
     let lanes = batch.noise.len();
-    let outputs = batch.wanted.iter().fold(Outputs::default(), |all, one| all.union(one.outputs));
+    let all = |all: Outputs, one: &Wanted| all.union(one.outputs).union(one.spread);
+    let outputs = batch.wanted.iter().fold(Outputs::default(), all);
     let host = matches!(batch.states, States::Host(_));
     let state = match batch.states {
         States::Host(rows) => State::from_rows(rows.iter().map(AsRef::as_ref), device),
@@ -184,8 +201,13 @@ fn step(world: &dyn WorldModel, batch: Batch) -> Computed {
 fn values(scene: &Scene, wanted: &[Wanted]) -> Vec<(Form, Value)> {
     let mut values = Vec::new();
     for form in [Form::F32, Form::F16, Form::U8] {
-        let of_form = wanted.iter().filter(|wanted| wanted.form == form);
-        let outputs = of_form.fold(Outputs::default(), |all, one| all.union(one.outputs));
+        let of_form = wanted.iter().map(|one| match (one.form == form, form) {
+            (true, Form::F32) => one.outputs.union(one.spread),
+            (true, _) => one.outputs,
+            (false, Form::F32) => one.spread,
+            (false, _) => Outputs::default(),
+        });
+        let outputs = of_form.fold(Outputs::default(), Outputs::union);
         for (output, tensor) in scene.tensors().filter(|(output, _)| outputs.contains(*output)) {
             values.push((form, value(output, tensor, numbers(output, form))));
         }

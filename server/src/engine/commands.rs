@@ -10,31 +10,22 @@ use gatsbi_models::{
     noise::RowNoise,
     scene::{Output, Outputs},
     state::StateRow,
-    world_model::ModelSpec,
 };
 use tokio::sync::{mpsc, oneshot};
 
-use super::door::Ticket;
+use super::{door::Ticket, models::ModelEntry, models::Newcomer};
 
-/// A model of the engine, by position.
+/// Whose work it is: rollouts are fair between tenants. A client may name itself; by default each session is one.
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+pub struct Tenant(pub u128);
+
+/// How soon work is wanted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct ModelId(pub usize);
-
-/// What the engine tells about a model.
-#[derive(Clone, Debug)]
-pub struct ModelEntry {
-    /// Which.
-    pub id: ModelId,
-    /// What it takes and gives.
-    pub spec: ModelSpec,
-    /// Its card, Markdown; empty if it has none.
-    pub card: String,
-    /// Bytes of a state row.
-    pub row_bytes: usize,
-    /// Where it computes, such as `cpu` or `cuda:0`.
-    pub device: String,
-    /// The state of a session that has seen nothing.
-    pub initial: Arc<StateRow>,
+pub enum Urgency {
+    /// Somebody waits for it: observations go before everything else, and what does not fit is refused at once.
+    Live,
+    /// It is one of many: observations share the time of rollouts, and what does not fit waits outside.
+    Bulk,
 }
 
 /// How numbers are given; object tables and single numbers are always 32-bit.
@@ -55,6 +46,8 @@ pub struct Wanted {
     pub outputs: Outputs,
     /// How.
     pub form: Form,
+    /// Which outputs are wanted as 32-bit floats besides, for the spread over samples.
+    pub spread: Outputs,
 }
 
 /// Type of the numbers of a [`Value`].
@@ -98,7 +91,7 @@ pub struct Spent {
 #[derive(Debug)]
 pub struct Observe {
     /// The model.
-    pub model: ModelId,
+    pub model: Arc<ModelEntry>,
     /// The belief before.
     pub state: Arc<StateRow>,
     /// Colours by row and column, `[3, H, W]` in [0, 1]; absent if no image came.
@@ -113,6 +106,8 @@ pub struct Observe {
     pub wanted: Wanted,
     /// When the answer is of no use any more.
     pub deadline: Option<Instant>,
+    /// How soon it is wanted.
+    pub urgency: Urgency,
 }
 
 /// A step with an observation.
@@ -126,33 +121,42 @@ pub struct Observed {
     pub spent: Spent,
 }
 
-/// Asks for a rollout. Row r is candidate `r % candidates` of sample `r / candidates`.
+/// Where a row of a rollout begins.
+#[derive(Clone, Debug)]
+pub struct RowStart {
+    /// The belief, pinned: whatever becomes of its session, the rollout keeps it.
+    pub state: Arc<StateRow>,
+    /// How its first step draws.
+    pub noise: RowNoise,
+    /// What the row's lane follows from.
+    pub lane: u64,
+}
+
+/// Asks for a rollout. Row r takes the actions of candidate `r % candidates`; it is its sample `r / candidates`.
 #[derive(Clone, Debug)]
 pub struct Imagine {
     /// The model.
-    pub model: ModelId,
-    /// The belief to start from.
-    pub start: Arc<StateRow>,
-    /// Steps that the belief has absorbed.
-    pub step: u64,
+    pub model: Arc<ModelEntry>,
+    /// Whose it is.
+    pub tenant: Tenant,
+    /// The rows: candidates times samples.
+    pub starts: Vec<RowStart>,
     /// `[candidates, horizon, A]` in raw units.
     pub actions: Arc<[f32]>,
     /// Candidates N.
     pub candidates: u32,
     /// Steps H of the actions.
     pub horizon: u32,
-    /// Samples S.
-    pub samples: u32,
-    /// Seed; absent for means.
-    pub seed: Option<u64>,
-    /// Whether candidates draw apart.
-    pub independent: bool,
     /// What is wanted.
     pub wanted: Wanted,
     /// Of which depths.
     pub depths: Depths,
+    /// Whether the states that the rows end in are wanted.
+    pub states: bool,
     /// When the answer is of no use any more.
     pub deadline: Option<Instant>,
+    /// How soon it is wanted.
+    pub urgency: Urgency,
 }
 
 /// Which depths of a rollout give outputs.
@@ -167,7 +171,7 @@ pub enum Depths {
 impl Imagine {
     /// Rows of the rollout.
     pub fn rows(&self) -> u32 {
-        self.candidates * self.samples
+        self.starts.len() as u32
     }
 
     /// The depth after which nothing more is wanted.
@@ -188,11 +192,12 @@ impl Imagine {
 
     /// How a row draws on its way to `depth`.
     pub fn noise(&self, row: u32, depth: u32) -> RowNoise {
-        let Some(seed) = self.seed else { return RowNoise::Mean };
-        let (candidate, sample) = (row % self.candidates, row / self.candidates);
-        // Limits keep both below 2^16, so no two of them meet.
-        let apart = if self.independent { candidate << 16 } else { 0 };
-        RowNoise::Sample { seed, sample: sample | apart, step: self.step + u64::from(depth) - 1 }
+        match self.starts[row as usize].noise {
+            RowNoise::Mean => RowNoise::Mean,
+            RowNoise::Sample { seed, sample, step } => {
+                RowNoise::Sample { seed, sample, step: step + u64::from(depth) - 1 }
+            }
+        }
     }
 
     /// The action that leads a row to `depth`.
@@ -216,6 +221,10 @@ pub struct Chunk {
     pub depth: u32,
     /// What was wanted.
     pub values: Vec<Value>,
+    /// What was wanted for the spread.
+    pub spread: Vec<Value>,
+    /// The states that the rows ended in, if they were wanted and this is where they ended.
+    pub states: Vec<StateRow>,
     /// Whether it is the rollout's last.
     pub last: bool,
     /// Where time went since the rollout's previous chunks.
@@ -233,11 +242,15 @@ pub enum Failure {
     NotFinite,
 }
 
-/// A request on its way to the model's thread. Whoever gives up drops the receiving end.
+/// What the model's thread is told. Whoever gives up on an answer drops the receiving end.
 #[derive(Debug)]
 pub(super) enum Command {
     Observe(Order<Observe, oneshot::Sender<Result<Observed, Failure>>>),
     Imagine(Order<Imagine, mpsc::Sender<Result<Chunk, Failure>>>),
+    /// A model to be served from now on.
+    Serve(Newcomer),
+    /// Nobody uses some model any more.
+    Unused,
 }
 
 /// A request with the way back, the room it takes in the queue, and the span it belongs to.

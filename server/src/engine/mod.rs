@@ -1,53 +1,48 @@
 //! The engine: the models on a thread of their own, reached by bounded channels only.
 //!
 //! [`Engine`] is the handle that everybody else holds. Behind it [`door`] decides how much work is let in,
-//! [`scheduler`] what is computed next, and [`executor`] computes it, with [`batch`] for one batch and [`arena`] for
-//! the states of rollouts. Sessions are not known here: an observe brings a state and takes the next one along, so
-//! a request that fails has changed nothing.
+//! [`scheduler`] what is computed next, and [`executor`] computes it, with [`served`] for one model's requests,
+//! [`batch`] for one batch and [`arena`] for the states of rollouts; [`models`] is what is known about models outside. Sessions are not known here: beliefs are
+//! rows of numbers that never change and that whoever needs them shares. An observe brings one and takes the next one
+//! along, so a request that fails has changed nothing, a fork costs no more than a pointer, and a rollout pins its
+//! belief by holding on to it.
+//!
+//! Answers do not depend on load. A row's bytes follow from its request, the sizes of blocks, and the lane that the
+//! request has in them ([`scheduler`]); random numbers follow from seed, sample and step alone. So with the same build,
+//! libtorch, processor model, threads and block sizes, equal requests have equal bytes, alone or among any others,
+//! whenever they come and whoever gives up meanwhile (`tests/api/mixes.rs`). Across builds, processors and block sizes,
+//! and on CUDA, where libraries choose algorithms by themselves, answers agree to rounding only.
 
 mod arena;
 mod batch;
 pub mod commands;
 mod door;
 mod executor;
+pub mod models;
 pub mod scheduler;
+mod served;
 
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
-    sync::Arc,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use gatsbi_models::{noise::PhiloxNoise, scene::Outputs, world_model::WorldModel};
-use tch::{Device, Kind, Tensor};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 
 use self::{
-    commands::{Chunk, Command, Failure, Imagine, ModelEntry, ModelId, Observe, Observed, Order},
-    door::Door,
-    executor::{Executor, Pace},
+    commands::{Chunk, Command, Failure, Imagine, Observe, Observed, Order, Urgency},
+    door::{Door, Load},
+    executor::Executor,
+    models::{LoadedModel, ModelEntry, ModelId, Newcomer},
     scheduler::Sizes,
 };
 use crate::error::Error;
 
 pub use self::door::DoorSizes;
-
-/// A model to be served.
-pub struct LoadedModel {
-    /// The model.
-    pub world: Box<dyn WorldModel>,
-    /// Name to serve it under.
-    pub name: String,
-    /// Its card, Markdown; empty if it has none.
-    pub card: String,
-}
-
-impl std::fmt::Debug for LoadedModel {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LoadedModel").field("name", &self.name).finish_non_exhaustive()
-    }
-}
 
 /// Sizes of the engine.
 #[derive(Clone, Copy, Debug)]
@@ -66,8 +61,9 @@ pub struct EngineConfig {
 #[derive(Clone, Debug)]
 pub struct Engine {
     commands: mpsc::Sender<Command>,
-    models: Arc<[ModelEntry]>,
     door: Arc<Door>,
+    next_model: Arc<AtomicU64>,
+    config: EngineConfig,
 }
 
 /// The chunks of a rollout as they come; dropped, the rollout ends.
@@ -84,7 +80,7 @@ impl Chunks {
     }
 }
 
-/// The model's thread cannot be started.
+/// The engine cannot be started, or cannot serve a model.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
     /// There is no thread.
@@ -93,53 +89,52 @@ pub enum EngineError {
     /// A step on made-up input failed.
     #[error("a model failed its warm-up: {0}")]
     WarmUp(String),
+    /// The engine has ended.
+    #[error("the engine has ended")]
+    Ended,
 }
 
 impl Engine {
-    /// Starts the thread, and waits until every model has made a step of each kind.
+    /// Starts the thread, with no model yet.
     ///
     /// # Errors
-    /// If there is no thread, or a model fails.
-    pub fn start(
-        models: Vec<LoadedModel>,
-        config: EngineConfig,
-    ) -> Result<(Self, JoinHandle<()>), EngineError> {
-        let entries: Vec<ModelEntry> = models.iter().enumerate().map(entry).collect();
-        let door = Arc::new(Door::new(config.door));
-        // Whoever was let in finds room here without waiting.
-        let (commands, received) = mpsc::channel(config.door.observes + config.door.rows);
-        let (ready, warm) = std::sync::mpsc::channel();
-        let behind = Arc::clone(&door);
+    /// If there is no thread.
+    pub fn start(config: EngineConfig) -> Result<(Self, JoinHandle<()>), EngineError> {
+        let door = Arc::new(Door::new(config.door, config.sizes));
+        // Whoever was let in finds room here without waiting; of bulk work there is half as much.
+        let most = 2 * (config.door.observes + config.door.rows);
+        let (commands, received) = mpsc::channel(most);
+        let executor = Executor::new(config, Arc::clone(&door), received);
         let thread = std::thread::Builder::new()
             .name("gatsbi-engine".to_owned())
             .spawn(move || {
                 // Threads of libtorch that have computed once do not hear of a later change.
                 tch::set_num_threads(config.threads as i32);
-                let warm =
-                    models.iter().try_for_each(|model| warm_up(model.world.as_ref(), config.sizes));
-                let failed = warm.is_err();
-                if ready.send(warm).is_err() || failed {
-                    return;
-                }
-                let pace = Pace { sizes: config.sizes, tick: config.tick };
-                Executor::new(models, pace, &behind, received).run();
+                executor.run();
             })
             .map_err(EngineError::Spawn)?;
-        match warm.recv() {
-            Ok(Ok(())) => Ok((Self { commands, models: entries.into(), door }, thread)),
-            Ok(Err(error)) => Err(EngineError::WarmUp(error)),
-            Err(gone) => Err(EngineError::WarmUp(gone.to_string())),
-        }
+        Ok((Self { commands, door, next_model: Arc::default(), config }, thread))
     }
 
-    /// The models, sorted by name.
-    pub fn models(&self) -> &[ModelEntry] {
-        &self.models
+    /// Serves a model from now on, for as long as the answer is held. Its first steps are made here, on the thread
+    /// that calls, which should be one that may be kept busy: nobody else waits for them.
+    ///
+    /// # Errors
+    /// If the model fails its first steps, or the engine has ended.
+    pub fn serve(&self, model: LoadedModel) -> Result<Arc<ModelEntry>, EngineError> {
+        let costs = models::warm_up(model.world.as_ref(), self.config.sizes)
+            .map_err(EngineError::WarmUp)?;
+        let id = ModelId(self.next_model.fetch_add(1, Ordering::Relaxed));
+        let entry = Arc::new(models::entry(id, &model, costs, self.commands.downgrade()));
+        let newcomer = Newcomer { entry: Arc::downgrade(&entry), id, model };
+        let served = self.commands.blocking_send(Command::Serve(newcomer));
+        served.map_err(|_ended| EngineError::Ended)?;
+        Ok(entry)
     }
 
-    /// A model.
-    pub fn model(&self, id: ModelId) -> &ModelEntry {
-        &self.models[id.0]
+    /// The most that a bulk rollout may be, in rows and bytes of outputs.
+    pub fn bulk_limit(&self) -> (u32, u64) {
+        Door::bulk_limit(self.config.door)
     }
 
     /// Makes a step with an observation.
@@ -147,7 +142,11 @@ impl Engine {
     /// # Errors
     /// If too many wait, or the model fails, or the deadline passes.
     pub async fn observe(&self, job: Observe) -> Result<Observed, Error> {
-        let ticket = self.door.admit_observe()?;
+        let costs = &job.model.costs;
+        let ticket = match job.urgency {
+            Urgency::Live => self.door.admit_observe(costs, job.deadline)?,
+            Urgency::Bulk => self.door.admit_bulk_observe(costs).await?,
+        };
         let (reply, answer) = oneshot::channel();
         let command = Command::Observe(order(job, reply, ticket));
         self.commands.send(command).await.map_err(gone)?;
@@ -157,12 +156,17 @@ impl Engine {
     /// Starts a rollout that may give up to `output_bytes` of outputs.
     ///
     /// # Errors
-    /// If too much is on its way already.
+    /// If too much is on its way already, or it cannot be done by its deadline.
     pub async fn imagine(&self, job: Imagine, output_bytes: u64) -> Result<Chunks, Error> {
-        let shape = (job.rows(), job.last_depth());
-        let (ticket, outputs) = self.door.admit_rollout(shape, output_bytes)?;
+        let (rows, steps) = (job.rows(), job.last_depth());
+        let load = Load { rows, steps, output_bytes, deadline: job.deadline };
+        let costs = &job.model.costs;
+        let (ticket, outputs) = match job.urgency {
+            Urgency::Live => self.door.admit_rollout(costs, load)?,
+            Urgency::Bulk => self.door.admit_bulk_rollout(costs, load).await?,
+        };
         // One chunk per row and depth at most, split no further than by row, and one failure.
-        let (reply, chunks) = mpsc::channel(shape.0 as usize * shape.1 as usize + 1);
+        let (reply, chunks) = mpsc::channel(rows as usize * steps as usize + 1);
         let command = Command::Imagine(order(job, reply, ticket));
         self.commands.send(command).await.map_err(gone)?;
         Ok(Chunks { chunks, _outputs: outputs })
@@ -186,46 +190,4 @@ fn order<Job, Reply>(job: Job, reply: Reply, ticket: door::Ticket) -> Order<Job,
 /// The thread has ended, which it does only when the process does.
 fn gone<E>(_: E) -> Error {
     Error::ShuttingDown
-}
-
-fn entry((id, model): (usize, &LoadedModel)) -> ModelEntry {
-    let initial = model.world.initial_state(1).to_rows().remove(0);
-    let device = match model.world.device() {
-        Device::Cuda(index) => format!("cuda:{index}"),
-        Device::Mps => "mps".to_owned(),
-        Device::Vulkan => "vulkan".to_owned(),
-        Device::Cpu => "cpu".to_owned(),
-    };
-    ModelEntry {
-        id: ModelId(id),
-        spec: gatsbi_models::world_model::ModelSpec {
-            name: model.name.clone(),
-            ..model.world.spec().clone()
-        },
-        card: model.card.clone(),
-        row_bytes: model.world.layout().row_bytes(),
-        device,
-        initial: Arc::new(initial),
-    }
-}
-
-/// Makes a step of each kind in the shapes that will be used, so that the first request does not pay for it.
-fn warm_up(world: &dyn WorldModel, sizes: Sizes) -> Result<(), String> {
-    let steps = || {
-        let float = (Kind::Float, world.device());
-        let neutral = Tensor::from_slice(&world.spec().neutral_action()).to_device(world.device());
-        let actions = |rows: i64| neutral.unsqueeze(0).expand([rows, -1], false).contiguous();
-        let outputs = Outputs::default();
-        let (observed, imagined) = (sizes.observe_block as i64, sizes.imagine_block as i64);
-        let size = world.spec().image_size;
-        let noise = PhiloxNoise::mean(observed, world.device());
-        for frame in [Some(Tensor::full([observed, 3, size, size], 0.5, float)), None] {
-            let state = world.initial_state(observed);
-            world.observe(&state, frame.as_ref(), &actions(observed), &noise, outputs);
-        }
-        let noise = PhiloxNoise::mean(imagined, world.device());
-        world.imagine(&world.initial_state(imagined), &actions(imagined), &noise, outputs);
-    };
-    let panicked = || format!("{} panicked", world.spec().name);
-    catch_unwind(AssertUnwindSafe(steps)).ok().ok_or_else(panicked)
 }

@@ -33,7 +33,11 @@ pub(super) enum Steps {
     Imagined {
         /// H.
         horizon: u32,
+        /// S.
+        samples: u32,
     },
+    /// One imagined step.
+    Stepped,
 }
 
 /// What a selection of outputs asks for.
@@ -46,11 +50,15 @@ pub(super) fn selection(
     spec: &ModelSpec,
 ) -> Result<Selection, Error> {
     let imagined = steps != Steps::Observed;
-    let mut outputs = Vec::new();
+    let (mut outputs, mut spread) = (Vec::new(), Vec::new());
     for (at, number) in asked.outputs.iter().enumerate() {
-        outputs.push(output(*number, &format!("outputs.outputs[{at}]"), imagined, spec)?);
+        let field = format!("outputs.outputs[{at}]");
+        match over_samples(*number, &field, steps)? {
+            Some(output) => spread.push(output),
+            None => outputs.push(output(*number, &field, imagined, spec)?),
+        }
     }
-    if imagined && outputs.is_empty() {
+    if matches!(steps, Steps::Imagined { .. }) && asked.outputs.is_empty() {
         return Err(Error::invalid("outputs.outputs", "empty", "at least one output"));
     }
     let form = match Encoding::try_from(asked.encoding) {
@@ -62,7 +70,11 @@ pub(super) fn selection(
         }
     };
     Ok(Selection {
-        wanted: Wanted { outputs: Outputs::from_iter(outputs), form },
+        wanted: Wanted {
+            outputs: Outputs::from_iter(outputs),
+            form,
+            spread: Outputs::from_iter(spread),
+        },
         png: asked.encoding() == Encoding::Png,
         depths: depths(asked, steps)?,
     })
@@ -70,22 +82,38 @@ pub(super) fn selection(
 
 fn depths(asked: &v1::OutputSelection, steps: Steps) -> Result<Depths, Error> {
     match (steps, asked.every_k, asked.last_only) {
-        (Steps::Observed, Some(k), _) => {
+        (Steps::Observed | Steps::Stepped, Some(k), _) => {
             Err(Error::invalid("outputs.every_k", k, "absent: this is a single step"))
         }
-        (Steps::Observed, None, true) => {
+        (Steps::Observed | Steps::Stepped, None, true) => {
             Err(Error::invalid("outputs.last_only", true, "absent: this is a single step"))
         }
         (Steps::Imagined { .. }, Some(k), true) => {
             Err(Error::invalid("outputs.every_k", k, "absent: last_only is set"))
         }
-        (Steps::Imagined { horizon }, Some(k), false) if !(1..=horizon).contains(&k) => {
+        (Steps::Imagined { horizon, .. }, Some(k), false) if !(1..=horizon).contains(&k) => {
             let expected = format!("1 to {horizon}, the horizon");
             Err(Error::invalid("outputs.every_k", k, expected))
         }
         (_, _, true) => Ok(Depths::Last),
         (_, k, false) => Ok(Depths::Every(k.unwrap_or(1))),
     }
+}
+
+/// What an output over samples is made of; nothing if it is none.
+fn over_samples(number: i32, field: &str, steps: Steps) -> Result<Option<Output>, Error> {
+    let Steps::Imagined { samples, .. } = steps else { return Ok(None) };
+    let output = match v1::Output::try_from(number) {
+        Ok(v1::Output::Spread) => Output::Frame,
+        Ok(v1::Output::ObjectSpread) => Output::Objects,
+        _ => return Ok(None),
+    };
+    if samples < 2 {
+        let output = v1::Output::try_from(number).map_or("", |output| output.as_str_name());
+        let reason = "it compares samples, of which there is only one";
+        return Err(Error::OutputUnavailable { field: field.to_owned(), output, reason });
+    }
+    Ok(Some(output))
 }
 
 fn output(number: i32, field: &str, imagined: bool, spec: &ModelSpec) -> Result<Output, Error> {
@@ -107,7 +135,9 @@ fn output(number: i32, field: &str, imagined: bool, spec: &ModelSpec) -> Result<
         v1::Output::LogLikelihood => Output::LogLikelihood,
         v1::Output::Keypoints => Output::Keypoints,
         v1::Output::Spread | v1::Output::ObjectSpread => {
-            return Err(Error::Unimplemented { what: "spread over samples" });
+            let (field, output) = (field.to_owned(), asked.as_str_name());
+            let reason = "it compares samples of a rollout";
+            return Err(Error::OutputUnavailable { field, output, reason });
         }
         v1::Output::Costs => return Err(Error::Unimplemented { what: "costs of rollouts" }),
     };

@@ -1,103 +1,165 @@
-//! Imagining: rollouts from a session's belief, chunk by chunk.
+//! Imagining: what a rollout is to be, and where its rows begin.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
 use gatsbi_models::{
+    noise::RowNoise,
     scene::{Output, Outputs},
     world_model::ModelSpec,
 };
 use gatsbi_proto::v1;
 
 use super::{
-    Service, answer, aside,
-    fields::{self, Steps},
+    Call, Service,
+    fields::{self, Selection, Steps},
+    rollout::Rollout,
+    spread::spread_bytes,
 };
 use crate::{
-    engine::{
-        Chunks,
-        commands::{Chunk, Form, Imagine},
-    },
+    engine::commands::{Depths, Form, Imagine, RowStart, Tenant, Urgency},
     error::Error,
-    telemetry, tensor,
+    sessions::session::Position,
+    tensor,
 };
 
-/// A rollout on its way. Dropped, it ends, and its rows make room for others.
+/// What a request asks of a rollout, wherever it starts.
+pub(super) struct Asked {
+    pub(super) actions: Option<v1::Tensor>,
+    pub(super) sampling: Option<v1::Sampling>,
+    pub(super) outputs: Option<v1::OutputSelection>,
+    pub(super) costs: Option<v1::CostProgram>,
+}
+
+/// A rollout that was asked for as it should be.
 #[derive(Debug)]
-pub struct Rollout {
-    chunks: Chunks,
-    /// What all chunks share.
-    common: v1::RolloutChunk,
-    png: bool,
-    deadline: Option<Instant>,
-    ended: bool,
+pub(super) struct Plan {
+    actions: Arc<[f32]>,
+    candidates: u32,
+    horizon: u32,
+    draws: Draws,
+    selection: Selection,
+    pub(super) output_bytes: u64,
+}
+
+impl Plan {
+    pub(super) fn rows(&self) -> u32 {
+        self.candidates * self.draws.samples
+    }
 }
 
 /// How a rollout draws.
-struct Draws {
-    seed: Option<u64>,
-    samples: u32,
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Draws {
+    pub(super) seed: Option<u64>,
+    pub(super) samples: u32,
     independent: bool,
 }
 
+impl Draws {
+    /// Where a row begins that is a sample of a candidate.
+    pub(super) fn start(
+        self,
+        position: &Position,
+        row: u32,
+        (candidate, sample): (u32, u32),
+    ) -> RowStart {
+        // Limits keep both below 2^16, so no two of them meet.
+        let apart = if self.independent { candidate << 16 } else { 0 };
+        let (sample, step) = (sample | apart, position.next_step);
+        let noise =
+            self.seed.map_or(RowNoise::Mean, |seed| RowNoise::Sample { seed, sample, step });
+        let lane = self.seed.unwrap_or(0).wrapping_add(row.into());
+        RowStart { state: Arc::clone(&position.state), noise, lane }
+    }
+
+    /// Where the rows of a rollout begin, all of them at one belief.
+    fn starts(self, position: &Position, candidates: u32) -> Vec<RowStart> {
+        let rows = 0..candidates * self.samples;
+        rows.map(|row| self.start(position, row, (row % candidates, row / candidates))).collect()
+    }
+}
+
 impl Service {
-    /// Starts a rollout; `deadline` is the call's own.
+    /// Starts a rollout.
     ///
     /// # Errors
     /// If the request is wrong, the session has moved, or there is too much to do already.
-    pub async fn imagine(
-        &self,
-        request: v1::ImagineRequest,
-        deadline: Option<Instant>,
-    ) -> Result<Rollout, Error> {
+    pub async fn imagine(&self, request: v1::ImagineRequest, call: Call) -> Result<Rollout, Error> {
         let session = self.session(&request.session_id)?;
-        let model = self.engine.model(session.opened.model);
-        let deadline = fields::deadline(request.timeout_millis, deadline)?;
-        if request.costs.is_some() {
+        // What is pinned here stays as it is, whatever the session observes meanwhile.
+        let position = session.position();
+        let model = Arc::clone(&position.model);
+        let deadline = fields::deadline(request.timeout_millis, call.deadline)?;
+        let asked = Asked {
+            actions: request.actions,
+            sampling: request.sampling,
+            outputs: request.outputs,
+            costs: request.costs,
+        };
+        let plan = self.plan(asked, &model.spec)?;
+        let last = position.last(request.at_step)?;
+        let tenant = call.tenant.unwrap_or(Tenant(session.id.bits()));
+        tracing::debug!(session = %session.id, last, ?plan, "imagining");
+        self.roll_out(plan, &position, (tenant, Urgency::Live), deadline).await
+    }
+
+    /// What a rollout on some model is to be.
+    ///
+    /// # Errors
+    /// If the request is wrong.
+    pub(super) fn plan(&self, asked: Asked, spec: &ModelSpec) -> Result<Plan, Error> {
+        if asked.costs.is_some() {
             return Err(Error::Unimplemented { what: "costs of rollouts" });
         }
-        let (actions, candidates, horizon) = self.actions(request.actions, &model.spec)?;
-        let draws = self.draws(request.sampling.unwrap_or_default())?;
+        let (actions, candidates, horizon) = self.actions(asked.actions, spec)?;
+        let draws = self.draws(asked.sampling.unwrap_or_default())?;
         let rows = u64::from(candidates) * u64::from(draws.samples);
         if rows > self.limits.max_rows.into() {
             let found = format!("{candidates} candidates x {} samples", draws.samples);
             let expected = format!("at most {} rows", self.limits.max_rows);
             return Err(Error::invalid("actions", found, expected));
         }
-        let outputs = request.outputs.unwrap_or_default();
-        let selection = fields::selection(&outputs, Steps::Imagined { horizon }, &model.spec)?;
+        let steps = Steps::Imagined { horizon, samples: draws.samples };
+        let selection = fields::selection(&asked.outputs.unwrap_or_default(), steps, spec)?;
+        let output_bytes =
+            self.output_bytes((candidates, draws.samples, horizon), selection, spec)?;
+        let actions = actions.into();
+        Ok(Plan { actions, candidates, horizon, draws, selection, output_bytes })
+    }
 
-        // What is pinned here stays as it is, whatever the session observes meanwhile.
-        let position = session.position();
-        let Some(last) = position.next_step.checked_sub(1) else {
-            return Err(Error::NothingObserved);
-        };
-        if let Some(at_step) = request.at_step.filter(|at_step| *at_step != last) {
-            return Err(Error::SessionMoved { at_step, last });
-        }
-        let job = Imagine {
-            model: model.id,
-            start: position.state,
-            step: position.next_step,
-            actions: actions.into(),
-            candidates,
-            horizon,
-            samples: draws.samples,
-            seed: draws.seed,
-            independent: draws.independent,
-            wanted: selection.wanted,
-            depths: selection.depths,
-            deadline,
-        };
-        let bytes = self.output_bytes(&job, &model.spec)?;
+    /// Starts a rollout from where some session is, or would be.
+    ///
+    /// # Errors
+    /// If there is too much to do already.
+    pub(super) async fn roll_out(
+        &self,
+        plan: Plan,
+        position: &Position,
+        (tenant, urgency): (Tenant, Urgency),
+        deadline: Option<Instant>,
+    ) -> Result<Rollout, Error> {
+        let Plan { actions, candidates, horizon, draws, selection, output_bytes } = plan;
         let common = v1::RolloutChunk {
-            at_step: last,
-            model_hash: model.spec.hash.clone(),
+            at_step: position.last(None)?,
+            model_hash: position.model.spec.hash.clone(),
             seed: draws.seed.unwrap_or(0),
             ..v1::RolloutChunk::default()
         };
-        tracing::debug!(session = %session.id, rows, horizon, output_bytes = bytes, "imagining");
-        let chunks = self.engine.imagine(job, bytes).await?;
-        Ok(Rollout { chunks, common, png: selection.png, deadline, ended: false })
+        let job = Imagine {
+            model: Arc::clone(&position.model),
+            tenant,
+            starts: draws.starts(position, candidates),
+            actions,
+            candidates,
+            horizon,
+            wanted: selection.wanted,
+            depths: selection.depths,
+            states: false,
+            deadline,
+            urgency,
+        };
+        let chunks = self.engine.imagine(job, output_bytes).await?;
+        Ok(Rollout::new(chunks, common, selection, draws.samples, deadline))
     }
 
     fn actions(
@@ -130,7 +192,7 @@ impl Service {
         Ok((tensor::floats(&actions, "actions")?, candidates, horizon))
     }
 
-    fn draws(&self, sampling: v1::Sampling) -> Result<Draws, Error> {
+    pub(super) fn draws(&self, sampling: v1::Sampling) -> Result<Draws, Error> {
         let samples = sampling.samples.unwrap_or(1);
         let most = self.limits.max_samples;
         if !(1..=most).contains(&samples) {
@@ -154,14 +216,24 @@ impl Service {
         }
     }
 
-    /// Bytes of all outputs of a rollout before they are made PNG.
-    fn output_bytes(&self, job: &Imagine, spec: &ModelSpec) -> Result<u64, Error> {
-        let steps = (1..=job.horizon).filter(|depth| job.wants(*depth)).count() as u64;
-        let row = row_bytes(job.wanted.outputs, job.wanted.form, spec);
-        let bytes = u64::from(job.rows()) * steps * row;
+    /// Bytes of all outputs of a rollout before they are made PNG, and of what the spread is made of.
+    fn output_bytes(
+        &self,
+        (candidates, samples, horizon): (u32, u32, u32),
+        selection: Selection,
+        spec: &ModelSpec,
+    ) -> Result<u64, Error> {
+        let Selection { wanted, depths, .. } = selection;
+        let steps = match depths {
+            Depths::Every(k) => u64::from(horizon / k),
+            Depths::Last => 1,
+        };
+        let rows = u64::from(candidates) * u64::from(samples);
+        let spread = u64::from(candidates) * steps * spread_bytes(wanted.spread, spec);
+        let bytes = rows * steps * row_bytes(wanted.outputs, wanted.form, spec) + spread;
         let most = self.limits.max_output_bytes;
         if bytes > most {
-            let found = format!("{bytes} bytes over {} rows and {steps} steps", job.rows());
+            let found = format!("{bytes} bytes over {rows} rows and {steps} steps");
             let expected =
                 format!("at most {most} bytes: fewer outputs, every_k, last_only, or U8");
             return Err(Error::invalid("outputs", found, expected));
@@ -170,46 +242,8 @@ impl Service {
     }
 }
 
-impl Rollout {
-    /// The next chunk; nothing after the last one or an error.
-    pub async fn next(&mut self) -> Option<Result<v1::ImagineResponse, Error>> {
-        if self.ended {
-            return None;
-        }
-        let chunk = match self.chunks.next().await {
-            Some(Ok(_)) if self.deadline.is_some_and(|at| at <= Instant::now()) => {
-                Err(Error::DeadlineExceeded)
-            }
-            Some(Ok(chunk)) => self.chunk(chunk).await,
-            Some(Err(error)) => Err(error),
-            // A rollout ends with its last chunk or a failure; only the end of the engine cuts it short.
-            None => Err(Error::ShuttingDown),
-        };
-        self.ended = chunk.as_ref().map_or(true, |chunk| chunk.last);
-        Some(chunk.map(|chunk| v1::ImagineResponse { chunk: Some(chunk) }))
-    }
-
-    async fn chunk(&self, chunk: Chunk) -> Result<v1::RolloutChunk, Error> {
-        telemetry::waited(telemetry::Kind::Imagine, chunk.spent.queue);
-        let began = Instant::now();
-        let (values, leading, png) = (chunk.values, [chunk.candidates, 1], self.png);
-        let encode = move || answer::outputs(values, &leading, png);
-        let outputs = if png { aside(encode).await? } else { encode() };
-        Ok(v1::RolloutChunk {
-            sample: chunk.sample,
-            first_candidate: chunk.first_candidate,
-            candidates: chunk.candidates,
-            depths: vec![chunk.depth],
-            outputs,
-            last: chunk.last,
-            timing: Some(answer::timing(chunk.spent, began.elapsed())),
-            ..self.common.clone()
-        })
-    }
-}
-
 /// Bytes of the outputs of one row at one step.
-fn row_bytes(outputs: Outputs, form: Form, spec: &ModelSpec) -> u64 {
+pub(super) fn row_bytes(outputs: Outputs, form: Form, spec: &ModelSpec) -> u64 {
     let number = if form == Form::F16 { 2 } else { 4 };
     let picture = if form == Form::U8 { 1 } else { number };
     let pixels = (spec.image_size * spec.image_size) as u64;

@@ -1,6 +1,6 @@
 //! Observing: one step of a session, once and in order.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
 use gatsbi_models::scene::Output;
 use gatsbi_proto::v1;
@@ -9,19 +9,22 @@ use sha2::{Digest as _, Sha256};
 use tokio::time::timeout_at;
 
 use super::{
-    Service, answer, aside,
+    Call, Service, answer, aside,
     fields::{self, Selection, Steps},
 };
 use crate::{
-    engine::commands::{ModelEntry, Observe, Value},
+    engine::{
+        commands::{Observe, Urgency, Value},
+        models::ModelEntry,
+    },
     error::Error,
     media::{self, Fitted, Target},
-    sessions::registry::{Answer, Position, Session},
+    sessions::session::{Answer, Position, Seen, Session},
     telemetry,
 };
 
 impl Service {
-    /// Absorbs one observation; `deadline` is the call's own.
+    /// Absorbs one observation.
     ///
     /// # Errors
     /// If the request is wrong, or the step does not follow, or the model cannot answer in time. The belief has then
@@ -29,47 +32,60 @@ impl Service {
     pub async fn observe(
         &self,
         request: v1::ObserveRequest,
-        deadline: Option<Instant>,
+        call: Call,
     ) -> Result<v1::ObserveResponse, Error> {
+        let belief = self.observe_unless(false, request, call).await?;
+        Ok(v1::ObserveResponse { belief: Some(belief) })
+    }
+
+    /// Absorbs one observation, without its image if that is to be skipped; the first image never is.
+    ///
+    /// # Errors
+    /// As [`Self::observe`].
+    pub async fn observe_unless(
+        &self,
+        skip_image: bool,
+        request: v1::ObserveRequest,
+        call: Call,
+    ) -> Result<v1::Belief, Error> {
         let session = self.session(&request.session_id)?;
-        let deadline = fields::deadline(request.timeout_millis, deadline)?;
+        let deadline = fields::deadline(request.timeout_millis, call.deadline)?;
         let outputs = request.outputs.unwrap_or_default();
         let observation = request.observation.unwrap_or_default();
-        let absorbing = self.absorb(&session, observation, &outputs, deadline);
-        let belief = match deadline {
-            None => absorbing.await?,
+        let absorbing = self.absorb(&session, (observation, skip_image), &outputs, deadline);
+        match deadline {
+            None => absorbing.await,
             // Dropped, it commits nothing.
             Some(at) => {
-                timeout_at(at.into(), absorbing).await.unwrap_or(Err(Error::DeadlineExceeded))?
+                timeout_at(at.into(), absorbing).await.unwrap_or(Err(Error::DeadlineExceeded))
             }
-        };
-        Ok(v1::ObserveResponse { belief: Some(belief) })
+        }
     }
 
     async fn absorb(
         &self,
         session: &Session,
-        observation: v1::Observation,
+        (observation, skip_image): (v1::Observation, bool),
         outputs: &v1::OutputSelection,
         deadline: Option<Instant>,
     ) -> Result<v1::Belief, Error> {
-        let model = self.engine.model(session.opened.model);
         let Some(step) = observation.step else {
             return Err(Error::invalid("observation.step", "absent", "the number of the step"));
         };
-        let selection = fields::selection(outputs, Steps::Observed, &model.spec)?;
         let digest = digest(&observation, outputs);
 
         let _turn = session.turn.lock().await;
-        let position = session.position();
-        if step != position.next_step {
-            return repeated(session, step, position.next_step, digest);
+        let Position { model, draws, next_step, state, image } = session.position();
+        let selection = fields::selection(outputs, Steps::Observed, &model.spec)?;
+        if step != next_step {
+            return repeated(session, step, next_step, digest);
         }
         let field = "observation.action";
         let action = fields::action(&observation.action, field, step == 0, &model.spec)?;
         let began = Instant::now();
-        let fitted = match observation.image {
-            Some(image) => Some(self.fit(image, model).await?),
+        let image_skipped = skip_image && step > 0 && observation.image.is_some();
+        let fitted = match observation.image.filter(|_| !image_skipped) {
+            Some(image) => Some(self.fit(image, "observation.image", &model).await?),
             None if step == 0 => {
                 let expected = "an image: a session's first observation needs one";
                 return Err(Error::invalid("observation.image", "absent", expected));
@@ -77,22 +93,27 @@ impl Service {
             None => None,
         };
         let decoding = began.elapsed();
-        let image = fitted.as_ref().map_or(position.image, |fitted| fitted.sent);
-        let predicted = fitted.is_none();
+        let image = fitted.as_ref().map_or(image, |fitted| fitted.sent);
+        let frame = fitted.map(|fitted| fitted.pixels);
+        let seen = Seen { step, frame: frame.clone(), action: action.clone(), image };
         let observed = self
             .engine
             .observe(Observe {
-                model: model.id,
-                state: position.state,
-                frame: fitted.map(|fitted| fitted.pixels),
+                model: Arc::clone(&model),
+                state,
+                frame,
                 action,
-                noise: session.noise(step),
-                lane: session.opened.seed,
+                noise: draws.noise(step),
+                lane: draws.seed,
                 wanted: selection.wanted,
                 deadline,
+                urgency: Urgency::Live,
             })
             .await?;
         telemetry::waited(telemetry::Kind::Observe, observed.spent.queue);
+        if image_skipped {
+            telemetry::image_skipped();
+        }
         let began = Instant::now();
         let objects = answer::objects(&observed.values, image, model.spec.preprocess);
         let outputs = self.outputs(observed.values, selection).await?;
@@ -100,14 +121,15 @@ impl Service {
             session_id: session.id.to_string(),
             step,
             model_hash: model.spec.hash.clone(),
-            predicted,
+            predicted: seen.frame.is_none(),
             repeated: false,
+            image_skipped,
             outputs,
             objects,
             timing: Some(answer::timing(observed.spent, decoding + began.elapsed())),
         };
-        let position = Position { next_step: step + 1, state: observed.state, image };
-        session.commit(position, Answer { digest, belief: belief.clone() });
+        let position = Position { model, draws, next_step: step + 1, state: observed.state, image };
+        session.commit(position, Answer { digest, belief: belief.clone() }, seen);
         let v1::Timing { queue_micros, compute_micros, encode_micros } =
             belief.timing.unwrap_or_default();
         tracing::debug!(
@@ -117,14 +139,20 @@ impl Service {
     }
 
     /// Decodes and fits an image, where it keeps nobody waiting.
-    async fn fit(&self, image: v1::Image, model: &ModelEntry) -> Result<Fitted, Error> {
+    pub(super) async fn fit(
+        &self,
+        image: v1::Image,
+        field: &str,
+        model: &ModelEntry,
+    ) -> Result<Fitted, Error> {
         let target = Target {
             size: model.spec.image_size as u32,
             preprocess: model.spec.preprocess,
             max_side: self.limits.max_image_side,
         };
         let slow = media::is_slow(&image, target);
-        let fit = move || media::fit(&image, "observation.image", target);
+        let field = field.to_owned();
+        let fit = move || media::fit(&image, &field, target);
         if slow { aside(fit).await? } else { fit() }
     }
 

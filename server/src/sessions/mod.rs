@@ -1,3 +1,6 @@
-//! Sessions: who is there, what each believes, and for how long it is kept.
+//! Sessions: one robot's stream of observations each ([`session`]), those that are open ([`registry`]), and a belief
+//! as bytes ([`snapshot`]).
 
 pub mod registry;
+pub mod session;
+pub mod snapshot;

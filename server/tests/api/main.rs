@@ -2,11 +2,18 @@
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+mod document;
 mod errors;
 mod failures;
+mod forks;
+mod handles;
 mod invariance;
 mod load;
+mod mixes;
+mod models;
 mod observe;
+mod predictions;
 mod rollouts;
 mod sessions;
+mod snapshots;
 mod support;

@@ -303,3 +303,46 @@ async fn a_control_loop_outlives_a_bad_frame() {
     assert_eq!(status.code(), Code::NotFound);
     server.app.shutdown().await;
 }
+
+#[tokio::test]
+async fn a_fast_camera_loses_images_and_no_actions() {
+    let server = TestServer::start().await;
+    let request =
+        v1::CreateSessionRequest { seed: Some(4), latest_wins: true, ..Default::default() };
+    let session = server.sessions.clone().create_session(request).await.unwrap();
+    let session = session.into_inner().session.unwrap();
+    assert!(session.latest_wins);
+    let skipped_before = server.metric("gatsbi_images_skipped_total").await;
+    // All observations of the loop have left before the first answer is there.
+    let requests: Vec<_> = (0..12).map(|step| streamed(observation(&session, step))).collect();
+    let mut sessions = server.sessions.clone();
+    let answers = sessions.observe_stream(tokio_stream::iter(requests)).await;
+    let mut answers = answers.unwrap().into_inner();
+    let mut beliefs = Vec::new();
+    while let Some(answer) = answers.message().await.unwrap() {
+        let Some(Result::Belief(belief)) = answer.result else { panic!("{answer:?}") };
+        beliefs.push(belief);
+    }
+    assert_eq!(
+        beliefs.iter().map(|belief| belief.step).collect::<Vec<_>>(),
+        (0..12).collect::<Vec<_>>()
+    );
+    assert!(beliefs.iter().all(|belief| belief.predicted == belief.image_skipped));
+    assert!(!beliefs[0].image_skipped && !beliefs[11].image_skipped, "first and latest are seen");
+    let skipped = beliefs.iter().filter(|belief| belief.image_skipped).count();
+    assert!(skipped >= 5, "{skipped} of 12");
+    let counted = server.metric("gatsbi_images_skipped_total").await - skipped_before;
+    assert!(counted >= skipped as f64, "{counted}");
+
+    // It believes what one does whose camera lost the same frames.
+    let twin = server.session(4).await;
+    for belief in &beliefs {
+        let mut request = observation(&twin, belief.step);
+        if belief.image_skipped {
+            request.observation.as_mut().unwrap().image = None;
+        }
+        assert_eq!(server.observe(request).await.unwrap().outputs, belief.outputs);
+    }
+    assert!(server.observe(observation(&session, 11)).await.unwrap().repeated);
+    server.app.shutdown().await;
+}

@@ -7,7 +7,7 @@ use gatsbi_proto::v1::{self, Encoding, Mode, Output};
 use serde_json::{Value as Json, json};
 
 use crate::support::{
-    ACTION, TestServer, actions, f32_tensor, observation, outputs, rollout, tensor,
+    ACTION, TestServer, actions, f32_tensor, floats, observation, outputs, rollout, tensor,
 };
 
 /// Bytes of each row's frame by (sample, candidate, depth).
@@ -195,5 +195,74 @@ async fn rest_gives_the_same_chunks_by_line_or_at_once() {
         assert_eq!(rows, expected.len());
         assert_eq!(chunks.last().unwrap()["last"], true);
     }
+    server.app.shutdown().await;
+}
+
+#[tokio::test]
+async fn spread_is_how_far_samples_disagree() {
+    let server = TestServer::start().await;
+    let session = server.seasoned(4, 1).await;
+    let mut request = rollout(&session, 3, 2);
+    request.sampling.as_mut().unwrap().samples = Some(4);
+    let wanted = [Output::Frame, Output::Objects, Output::Spread, Output::ObjectSpread];
+    request.outputs = Some(outputs(&wanted, Encoding::F32));
+    let chunks = server.imagine(request.clone()).await.unwrap();
+    let mut samples: BTreeMap<(u32, u32), Vec<Vec<f32>>> = BTreeMap::new();
+    let mut places: BTreeMap<(u32, u32), Vec<Vec<f32>>> = BTreeMap::new();
+    for chunk in chunks.iter().filter(|chunk| !chunk.over_samples) {
+        assert_eq!(chunk.outputs.len(), 2);
+        let frames = floats(tensor(&chunk.outputs, Output::Frame));
+        let tracks = chunk.outputs.iter().find_map(|value| match &value.value {
+            Some(v1::output_value::Value::Tracks(tracks)) => tracks.values.as_ref(),
+            _ => None,
+        });
+        let tracks = floats(tracks.unwrap());
+        for at in 0..chunk.candidates as usize {
+            let key = (chunk.first_candidate + at as u32, chunk.depths[0]);
+            samples.entry(key).or_default().push(frames[at * 12_288..][..12_288].to_vec());
+            let objects = tracks[at * 42..][..42].chunks_exact(6);
+            places.entry(key).or_default().push(objects.flat_map(|o| o[1..3].to_vec()).collect());
+        }
+    }
+    let deviations = |rows: &[Vec<f32>]| -> Vec<f32> {
+        let count = rows.len() as f32;
+        (0..rows[0].len())
+            .map(|at| {
+                let mean = rows.iter().map(|row| row[at]).sum::<f32>() / count;
+                (rows.iter().map(|row| (row[at] - mean).powi(2)).sum::<f32>() / count).sqrt()
+            })
+            .collect()
+    };
+    let spread: Vec<&v1::RolloutChunk> = chunks.iter().filter(|chunk| chunk.over_samples).collect();
+    assert_eq!(spread.len(), 6, "three candidates at two depths");
+    for chunk in &spread {
+        let key = (chunk.first_candidate, chunk.depths[0]);
+        let map = tensor(&chunk.outputs, Output::Spread);
+        assert_eq!(map.shape, [1, 1, 64, 64]);
+        let colours = deviations(&samples[&key]);
+        let expected = colours.chunks_exact(3).map(|colour| colour.iter().sum::<f32>() / 3.0);
+        assert!(floats(map).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-4));
+        let objects = tensor(&chunk.outputs, Output::ObjectSpread);
+        assert_eq!(objects.shape, [1, 1, 7, 2]);
+        let expected = deviations(&places[&key]);
+        assert!(floats(objects).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-4));
+    }
+    assert!(floats(tensor(&spread[0].outputs, Output::Spread)).iter().any(|x| *x > 1e-3));
+    assert_eq!(chunks.iter().filter(|chunk| chunk.last).count(), 1);
+    assert!(chunks.last().unwrap().last);
+
+    // Alone it is the same, and nothing else comes.
+    request.outputs = Some(outputs(&[Output::Spread], Encoding::U8));
+    let alone = server.imagine(request.clone()).await.unwrap();
+    assert!(alone.len() == 6 && alone.last().unwrap().last);
+    for chunk in &alone {
+        let twin = spread.iter().find(|other| {
+            (other.first_candidate, &other.depths) == (chunk.first_candidate, &chunk.depths)
+        });
+        assert_eq!(chunk.outputs, twin.unwrap().outputs[..1]);
+    }
+    request.sampling.as_mut().unwrap().samples = None;
+    let status = server.imagine(request).await.unwrap_err();
+    assert_eq!(status.code(), tonic::Code::FailedPrecondition);
     server.app.shutdown().await;
 }

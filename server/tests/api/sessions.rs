@@ -8,7 +8,7 @@ use tonic_reflection::pb::v1::{
     server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
 };
 
-use crate::support::{TestServer, balls, config, observation};
+use crate::support::{TestServer, config, observation, serving_both};
 
 #[tokio::test]
 async fn models_are_described_on_both_apis() {
@@ -106,12 +106,7 @@ async fn there_are_only_so_many_sessions() {
 
 #[tokio::test]
 async fn several_models_are_served_side_by_side() {
-    let server = TestServer::serving(config(), |config| {
-        let mut models = gatsbi_server::app::load(config)?;
-        models.push(balls());
-        Ok(models)
-    })
-    .await;
+    let server = serving_both().await;
     let (status, problem) = server.post_json("/v1/sessions", &json!({})).await;
     assert_eq!((status, problem["fields"][0]["field"].as_str()), (400, Some("model")));
     let tiny = v1::CreateSessionRequest { model: "tiny".to_owned(), ..Default::default() };
@@ -170,23 +165,10 @@ async fn health_readiness_metrics_and_reflection_are_there() {
 async fn what_is_not_there_yet_says_so() {
     let server = TestServer::start().await;
     let session = server.session(1).await;
-    let fork = v1::ForkSessionRequest { session_id: session.id.clone(), ..Default::default() };
-    let status = server.sessions.clone().fork_session(fork).await.unwrap_err();
-    assert_eq!(status.code(), Code::Unimplemented);
-    for path in ["fork", "rewind", "scores", "plans"] {
+    for path in ["scores", "plans"] {
         let path = format!("/v1/sessions/{}/{path}", session.id);
         let (status, problem) = server.post_json(&path, &json!({})).await;
         assert_eq!((status, problem["reason"].as_str()), (501, Some("UNIMPLEMENTED")), "{path}");
     }
-    let (status, _) = server.post_json("/v1/sessions", &json!({ "keep_steps": 3 })).await;
-    assert_eq!(status, 501);
-    let swap = reqwest::Client::new().put(format!("http://{}/v1/models/tiny", server.app.admin));
-    assert_eq!(swap.send().await.unwrap().status(), 501);
-    let channel = tonic::transport::Channel::from_shared(format!("http://{}", server.app.admin));
-    let mut admin = v1::admin_service_client::AdminServiceClient::new(
-        channel.unwrap().connect().await.unwrap(),
-    );
-    let status = admin.load_model(v1::LoadModelRequest::default()).await.unwrap_err();
-    assert_eq!(status.code(), Code::Unimplemented);
     server.app.shutdown().await;
 }

@@ -19,7 +19,7 @@ use gatsbi_proto::v1::{
 use gatsbi_server::{
     app::{self, App},
     config::{CheckpointArg, Config},
-    engine::LoadedModel,
+    engine::models::LoadedModel,
 };
 use serde_json::Value as Json;
 use tch::Device;
@@ -40,35 +40,41 @@ pub(crate) struct TestServer {
 /// A checkpoint of the tiny preset with untrained weights.
 pub(crate) fn checkpoint() -> &'static Path {
     static FILE: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
-    let (_, path) = FILE.get_or_init(|| {
-        let action = |i: usize| ActionDimension {
-            name: format!("joint {i}"),
-            unit: "rad/s".to_owned(),
-            offset: 0.25,
-            scale: 0.5,
-        };
-        let header = Header {
-            name: "tiny".to_owned(),
-            model: presets::tiny(),
-            agent_slot: Some(AgentSlot { index: 0, score: None }),
-            actions: (0..ACTION).map(action).collect(),
-            preprocess: Preprocess::CentreCrop,
-            frame_period: Some(0.2),
-            first_action: FirstAction::Neutral,
-            provenance: Provenance { seed: 5, ..Provenance::default() },
-        };
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("tiny.safetensors");
-        Checkpoint::untrained(header, Device::Cpu).save(&path, Precision::Single).unwrap();
-        std::fs::write(path.with_extension("md"), "# Tiny\n").unwrap();
-        (folder, path)
-    });
-    path
+    &FILE.get_or_init(|| tiny(5)).1
 }
 
-/// A model of the balls preset with untrained weights: no agent, no detector, no action.
-pub(crate) fn balls() -> LoadedModel {
+/// Another one, that differs in its provenance alone, and so in its hash.
+pub(crate) fn checkpoint_of_another() -> &'static Path {
+    static FILE: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    &FILE.get_or_init(|| tiny(6)).1
+}
+
+fn tiny(seed: u64) -> (tempfile::TempDir, PathBuf) {
+    let action = |i: usize| ActionDimension {
+        name: format!("joint {i}"),
+        unit: "rad/s".to_owned(),
+        offset: 0.25,
+        scale: 0.5,
+    };
     let header = Header {
+        name: "tiny".to_owned(),
+        model: presets::tiny(),
+        agent_slot: Some(AgentSlot { index: 0, score: None }),
+        actions: (0..ACTION).map(action).collect(),
+        preprocess: Preprocess::CentreCrop,
+        frame_period: Some(0.2),
+        first_action: FirstAction::Neutral,
+        provenance: Provenance { seed, ..Provenance::default() },
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("tiny.safetensors");
+    Checkpoint::untrained(header, Device::Cpu).save(&path, Precision::Single).unwrap();
+    std::fs::write(path.with_extension("md"), "# Tiny\n").unwrap();
+    (folder, path)
+}
+
+fn balls_header() -> Header {
+    Header {
         name: "balls".to_owned(),
         model: presets::balls(),
         agent_slot: None,
@@ -77,9 +83,25 @@ pub(crate) fn balls() -> LoadedModel {
         frame_period: None,
         first_action: FirstAction::Neutral,
         provenance: Provenance::default(),
-    };
-    let world = GatsbiWorld::new(Checkpoint::untrained(header, Device::Cpu));
+    }
+}
+
+/// A model of the balls preset with untrained weights: no agent, no detector, no action.
+pub(crate) fn balls() -> LoadedModel {
+    let world = GatsbiWorld::new(Checkpoint::untrained(balls_header(), Device::Cpu));
     LoadedModel { world: Box::new(world), name: "balls".to_owned(), card: String::new() }
+}
+
+/// A checkpoint of it.
+pub(crate) fn balls_checkpoint() -> &'static Path {
+    static FILE: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    let (_, path) = FILE.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("balls.safetensors");
+        Checkpoint::untrained(balls_header(), Device::Cpu).save(&path, Precision::Half).unwrap();
+        (folder, path)
+    });
+    path
 }
 
 /// A configuration for tests: free ports, one thread.
@@ -101,6 +123,22 @@ pub(crate) fn named(name: &str) -> Config {
         threads: 1,
         ..Config::default()
     }
+}
+
+/// A configuration with another checkpoint.
+pub(crate) fn other_checkpoint() -> Config {
+    let path = checkpoint_of_another().to_owned();
+    Config { checkpoints: vec![CheckpointArg { name: None, path }], ..config() }
+}
+
+/// A server of the models `tiny` and `balls`.
+pub(crate) async fn serving_both() -> TestServer {
+    TestServer::serving(config(), |config| {
+        let mut models = app::load(config)?;
+        models.push(balls());
+        Ok(models)
+    })
+    .await
 }
 
 impl TestServer {
@@ -150,6 +188,10 @@ impl TestServer {
         self.http.post(format!("http://{}{path}", self.app.http))
     }
 
+    pub(crate) fn put(&self, path: &str) -> reqwest::RequestBuilder {
+        self.http.put(format!("http://{}{path}", self.app.http))
+    }
+
     pub(crate) fn delete(&self, path: &str) -> reqwest::RequestBuilder {
         self.http.delete(format!("http://{}{path}", self.app.http))
     }
@@ -161,6 +203,13 @@ impl TestServer {
     /// Opens a session with a seed.
     pub(crate) async fn session(&self, seed: u64) -> v1::Session {
         let request = v1::CreateSessionRequest { seed: Some(seed), ..Default::default() };
+        self.sessions.clone().create_session(request).await.unwrap().into_inner().session.unwrap()
+    }
+
+    /// Opens a session of a model.
+    pub(crate) async fn session_on(&self, model: &str, seed: u64) -> v1::Session {
+        let model = model.to_owned();
+        let request = v1::CreateSessionRequest { model, seed: Some(seed), ..Default::default() };
         self.sessions.clone().create_session(request).await.unwrap().into_inner().session.unwrap()
     }
 

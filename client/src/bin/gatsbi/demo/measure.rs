@@ -10,6 +10,9 @@ use crate::{
     recording::Recording,
 };
 
+/// The future in which nothing moves.
+const COPY: &str = "a copy of the last observed frame";
+
 /// The agent and the objects in the last observed frame, beside the recording's labels where it has some.
 pub(super) struct Found {
     step: u64,
@@ -23,9 +26,19 @@ pub(super) struct Found {
     labelled: Option<Vec<(f64, f64)>>,
 }
 
-/// Errors of each imagined step.
+/// Errors of each imagined step, and how well each candidate's future fits the recorded one.
 pub(super) struct Errors {
     pub(super) steps: Vec<StepErrors>,
+    fits: Vec<Fit>,
+}
+
+/// How well a future fits the recorded one, as a mean over its steps.
+struct Fit {
+    /// What is done, in words.
+    name: String,
+    mse: f64,
+    /// Intersection over union of the agent's mask and the recording's label.
+    agent_iou: Option<f64>,
 }
 
 /// Mean squared errors of one step, over the pixels and colours of the frame in [0, 1].
@@ -68,14 +81,14 @@ impl Found {
                 let iou = self.agent_iou.map_or_else(String::new, |iou| {
                     format!("; {iou:.2} intersection over union with the recording's label")
                 });
-                format!("agent      slot {slot}, {:.1} % of the image{iou}\n", share * 100.0)
+                format!("agent     slot {slot}, {:.1} % of the image{iou}\n", share * 100.0)
             }
-            _ => "agent      the model has none\n".to_owned(),
+            _ => "agent     the model has none\n".to_owned(),
         };
         let labelled = self.labelled.as_ref().map_or_else(String::new, |labelled| {
             format!("; the recording's labels show {}", labelled.len())
         });
-        text += &format!("objects    {} after step {}{labelled}\n", self.objects.len(), self.step);
+        text += &format!("objects   {} after step {}{labelled}\n", self.objects.len(), self.step);
         if !self.objects.is_empty() {
             text += "\n";
             text += &print::objects(&self.objects);
@@ -98,25 +111,23 @@ impl Found {
 
 impl Errors {
     pub(super) fn of(story: &Story) -> anyhow::Result<Self> {
-        let frames = story.rollout.outputs.array(Output::Frame).context("no frames came")?;
         let last = story.beliefs.len() - 1;
         let episode = &story.recording.episode;
-        let step = |(at, &depth): (usize, &u32)| {
-            let recorded = episode.frame(last + depth as usize);
-            let imagined = frames.at(&[0, 0, at]);
-            let Numbers::U8(imagined) = imagined.numbers() else { return None };
-            Some(StepErrors {
-                depth,
-                imagined: squared_error(imagined, recorded),
-                copied: squared_error(episode.frame(last), recorded),
-            })
+        let mut fits = Vec::new();
+        for (number, candidate) in story.candidates.iter().enumerate() {
+            let mse = mean(squared_errors(story, number)?);
+            let name = candidate.name.clone();
+            fits.push(Fit { name, mse, agent_iou: agent_ious(story, number).map(mean) });
+        }
+        let imagined = squared_errors(story, 0)?;
+        let step = |(&depth, imagined): (&u32, f64)| {
+            let copied = squared_error(episode.frame(last), episode.frame(last + depth as usize));
+            StepErrors { depth, imagined, copied }
         };
-        let steps: Option<_> = story.rollout.depths.iter().enumerate().map(step).collect();
-        Ok(Self { steps: steps.context("frames came in another form than was asked for")? })
-    }
-
-    fn mean(&self, error: impl Fn(&StepErrors) -> f64) -> f64 {
-        self.steps.iter().map(error).sum::<f64>() / self.steps.len() as f64
+        let steps: Vec<_> = story.rollout.depths.iter().zip(imagined).map(step).collect();
+        let mse = mean(steps.iter().map(|step| step.copied).collect());
+        fits.push(Fit { name: COPY.to_owned(), mse, agent_iou: copied_ious(story).map(mean) });
+        Ok(Self { steps, fits })
     }
 
     pub(super) fn described(&self) -> String {
@@ -138,12 +149,28 @@ impl Errors {
             .iter()
             .map(|step| row(step.depth.to_string(), step.imagined, step.copied))
             .collect();
-        let (imagined, copied) = (self.mean(|step| step.imagined), self.mean(|step| step.copied));
+        let imagined = mean(self.steps.iter().map(|step| step.imagined).collect());
+        let copied = mean(self.steps.iter().map(|step| step.copied).collect());
         rows.push(row("mean".to_owned(), imagined, copied));
         text.push_str(&table(
             &["step", "imagined MSE", "PSNR", "copied MSE", "PSNR", "gain dB"],
             rows,
         ));
+        text.push_str(
+            "\nhow well each future fits the recorded one, as a mean over its steps: where the model has learned what \
+             actions do,\nthe recorded ones fit best\n",
+        );
+        let labelled = self.fits.iter().any(|fit| fit.agent_iou.is_some());
+        let iou =
+            |fit: &Fit| fit.agent_iou.map_or_else(|| "-".to_owned(), |iou| format!("{iou:.2}"));
+        let rows = self.fits.iter().map(|fit| {
+            let mut row =
+                vec![fit.name.clone(), format!("{:.5}", fit.mse), format!("{:.2}", psnr(fit.mse))];
+            row.extend(labelled.then(|| iou(fit)));
+            row
+        });
+        let titles = ["<future", "MSE", "PSNR", "agent's IoU"];
+        text.push_str(&table(&titles[..if labelled { 4 } else { 3 }], rows));
         text
     }
 
@@ -158,7 +185,14 @@ impl Errors {
                 "copied_psnr": psnr(*copied),
             })
         };
-        self.steps.iter().map(step).collect()
+        let fit = |fit: &Fit| {
+            let Fit { name, mse, agent_iou } = fit;
+            json!({ "name": name, "mse": mse, "psnr": psnr(*mse), "agent_iou": agent_iou })
+        };
+        json!({
+            "steps": self.steps.iter().map(step).collect::<Vec<_>>(),
+            "futures": self.fits.iter().map(fit).collect::<Vec<_>>(),
+        })
     }
 }
 
@@ -167,12 +201,58 @@ pub(super) fn psnr(mse: f64) -> f64 {
     -10.0 * mse.log10()
 }
 
+/// Errors of a candidate's frames, step by step.
+fn squared_errors(story: &Story, candidate: usize) -> anyhow::Result<Vec<f64>> {
+    let frames = story.rollout.outputs.array(Output::Frame).context("no frames came")?;
+    let last = story.beliefs.len() - 1;
+    let error = |(at, &depth): (usize, &u32)| {
+        let imagined = frames.at(&[0, candidate, at]);
+        let Numbers::U8(imagined) = imagined.numbers() else { return None };
+        Some(squared_error(imagined, story.recording.episode.frame(last + depth as usize)))
+    };
+    let errors: Option<_> = story.rollout.depths.iter().enumerate().map(error).collect();
+    errors.context("frames came in another form than was asked for")
+}
+
+/// How far a candidate's agent is where the recording's is, step by step; nothing without agent or labels.
+fn agent_ious(story: &Story, candidate: usize) -> Option<Vec<f64>> {
+    let masks = story.rollout.outputs.array(Output::AgentMask)?;
+    let last = story.beliefs.len() - 1;
+    let iou = |(at, &depth): (usize, &u32)| {
+        let (labels, legend) = labels(&story.recording, last + depth as usize)?;
+        Some(self::iou(&masks.at(&[0, candidate, at]).to_f32(), labels, legend.agent))
+    };
+    story.rollout.depths.iter().enumerate().map(iou).collect()
+}
+
+/// The same of an agent that does not move, by the labels.
+fn copied_ious(story: &Story) -> Option<Vec<f64>> {
+    story.model.agent_slot?;
+    let last = story.beliefs.len() - 1;
+    let (now, legend) = labels(&story.recording, last)?;
+    let now: Vec<f32> =
+        now.iter().map(|label| f32::from(u8::from(*label == legend.agent))).collect();
+    let iou = |&depth: &u32| {
+        Some(self::iou(&now, labels(&story.recording, last + depth as usize)?.0, legend.agent))
+    };
+    story.rollout.depths.iter().map(iou).collect()
+}
+
+fn mean(numbers: Vec<f64>) -> f64 {
+    let count = numbers.len();
+    numbers.into_iter().sum::<f64>() / count as f64
+}
+
 fn squared_error(a: &[u8], b: &[u8]) -> f64 {
     let square = |(a, b): (&u8, &u8)| ((f64::from(*a) - f64::from(*b)) / 255.0).powi(2);
     a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64
 }
 
-fn labels(recording: &Recording, t: usize) -> Option<(&[u8], gatsbi_episodes::LabelLegend)> {
+/// What a recording says is in frame `t`.
+pub(super) fn labels(
+    recording: &Recording,
+    t: usize,
+) -> Option<(&[u8], gatsbi_episodes::LabelLegend)> {
     Some((recording.episode.mask(t)?, recording.info.labels?))
 }
 

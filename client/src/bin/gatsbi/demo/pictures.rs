@@ -8,11 +8,11 @@ use image::RgbImage;
 
 use super::{
     Story,
-    measure::{Errors, psnr},
+    measure::{Errors, labels, psnr},
 };
 use crate::picture::{
     ENLARGED, enlarge, image,
-    scene::{Scene, cut_out, grey},
+    scene::{Scene, cut_out, grey, labelled},
     sheet::{self, Row, Sheet, Tile},
 };
 
@@ -39,6 +39,7 @@ fn observed_sheet(story: &Story) -> anyhow::Result<Sheet> {
         "agent: what the agent's mask cuts out of each frame",
         "objects: their masks, a colour each",
         "overlay: agent blue, objects in their colours, boxes with ids",
+        "labels: what the recording says is there; its objects have a numbering of their own",
     ]
     .map(|heading| Row { heading: heading.to_owned(), tiles: Vec::new() })
     .into();
@@ -58,11 +59,14 @@ fn observed_sheet(story: &Story) -> anyhow::Result<Sheet> {
             enlarge(&scene.objects(), ENLARGED),
             scene.overlay(ENLARGED),
         ];
+        let labels = labels(&story.recording, t)
+            .map(|(labels, legend)| enlarge(&labelled((width, height), labels, legend), ENLARGED));
         let step = format!("step {}", belief.step);
-        for (row, picture) in rows.iter_mut().zip(pictures) {
+        for (row, picture) in rows.iter_mut().zip(pictures.into_iter().chain(labels)) {
             row.tiles.push(Tile::new(picture, &[&step]));
         }
     }
+    rows.retain(|row| !row.tiles.is_empty());
     Ok(Sheet { title: format!("{}: what it saw", story.model.name), rows })
 }
 
@@ -195,12 +199,13 @@ fn output(belief: &gatsbi_client::Belief, which: Output) -> anyhow::Result<&Arra
     belief.outputs.array(which).with_context(|| format!("no {} came", which.as_str_name()))
 }
 
-/// Positions of at most `most` of `n` steps: close together at first, further apart later, the last among them.
+/// Positions of at most `most` of `n` steps: close together at first, further apart later, the first and the last among
+/// them.
 fn spaced(n: usize, most: usize) -> Vec<usize> {
     let most = most.min(n);
     let mut positions: Vec<usize> = Vec::new();
     for column in 0..most {
-        let share = (column + 1) as f64 / most as f64;
+        let share = column as f64 / (most.max(2) - 1) as f64;
         // At least one further than the one before, and leaving room for those to come.
         let wanted = (n as f64).powf(share).round() as usize - 1;
         let least = positions.last().map_or(0, |before| before + 1);
@@ -232,7 +237,7 @@ mod tests {
     #[test]
     fn columns_are_denser_at_first_and_end_with_the_last_step() {
         let columns = spaced(35, 8);
-        assert_eq!((columns.len(), columns[0], columns[7]), (8, 1, 34));
+        assert_eq!((columns.len(), columns[0], columns[7]), (8, 0, 34));
         assert!(columns.is_sorted_by(|a, b| a < b), "{columns:?}");
         assert!(columns[7] - columns[6] > columns[1] - columns[0], "{columns:?}");
         assert_eq!(spaced(3, 8), [0, 1, 2]);

@@ -2,6 +2,7 @@
 
 use embedded_graphics::mono_font::ascii::FONT_6X10;
 use gatsbi_client::{Array, Object};
+use gatsbi_episodes::LabelLegend;
 use image::{Rgb, RgbImage};
 
 use super::{AGENT, canvas::Canvas, colour_of, enlarge};
@@ -31,6 +32,15 @@ pub(crate) fn grey(size: (u32, u32), mask: &[f32]) -> RgbImage {
 pub(crate) fn cut_out(frame: &RgbImage, mask: &[f32]) -> RgbImage {
     let pixels: Vec<Rgb<u8>> = frame.pixels().copied().collect();
     paint(frame.dimensions(), |at| mix(EMPTY, pixels[at], mask[at]))
+}
+
+/// A recording's labels in the colours of agent and objects.
+pub(crate) fn labelled(size: (u32, u32), labels: &[u8], legend: LabelLegend) -> RgbImage {
+    paint(size, |at| match labels[at] {
+        label if label == legend.agent => AGENT,
+        label if label >= legend.first_object => colour_of((label - legend.first_object).into()),
+        _ => DARK,
+    })
 }
 
 impl Scene {
@@ -138,6 +148,14 @@ mod tests {
         assert_eq!((agent.get_pixel(0, 0), agent.get_pixel(1, 0)), (&Rgb([100; 3]), &EMPTY));
         let grey = grey((16, 16), scene.agent.as_ref().unwrap());
         assert_eq!((grey.get_pixel(0, 0), grey.get_pixel(1, 0)), (&Rgb([255; 3]), &Rgb([0; 3])));
+    }
+
+    #[test]
+    fn labels_have_the_colours_of_what_they_name() {
+        let legend = LabelLegend { background: 0, agent: 1, first_object: 2 };
+        let picture = labelled((4, 1), &[0, 1, 2, 4], legend);
+        let colours: Vec<_> = picture.pixels().copied().collect();
+        assert_eq!(colours, [DARK, AGENT, colour_of(0), colour_of(2)]);
     }
 
     #[test]

@@ -1,0 +1,99 @@
+//! Steps of a frozen model on one thread: this crate's side in `cargo xtask bench`.
+//!
+//! It takes turns with the model's twin (`tests/reference/gatsbi_twin/timing.py`), so it works only when it is told to:
+//! each line `CHECKPOINT BATCH STEP SECONDS` on standard input has a step (`observe` or `imagine`) repeated for so long,
+//! at least once, and is answered by how often it was made; whoever asks looks at the processor time meanwhile. Steps
+//! are those that a server makes: packed state, actions in raw units, counter-based noise, new objects looked for in
+//! every frame, nothing drawn.
+
+#![expect(clippy::print_stdout, reason = "answers go to standard output")]
+
+use std::{
+    collections::HashMap,
+    error::Error,
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use gatsbi_models::{
+    gatsbi::world::GatsbiWorld,
+    noise::{PhiloxNoise, RowNoise},
+    scene::Outputs,
+    state::State,
+    world_model::WorldModel,
+};
+use tch::{Device, Kind, Tensor};
+
+/// A batch of a model in the midst of its scenes.
+struct Batch {
+    world: GatsbiWorld,
+    state: State,
+    frame: Tensor,
+    action: Tensor,
+    noise: PhiloxNoise,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    tch::set_num_threads(1);
+    tch::set_num_interop_threads(1);
+    let mut batches = HashMap::new();
+    for line in std::io::stdin().lines() {
+        let line = line?;
+        let &[checkpoint, rows, step, seconds] = &line.split(' ').collect::<Vec<_>>()[..] else {
+            return Err(format!("{line:?} is not CHECKPOINT BATCH STEP SECONDS").into());
+        };
+        let rows: i64 = rows.parse()?;
+        let key = (checkpoint.to_owned(), rows);
+        if !batches.contains_key(&key) {
+            batches.insert(key.clone(), Batch::new(Path::new(checkpoint), rows)?);
+        }
+        let batch = &batches[&key];
+        let time = Duration::from_secs_f64(seconds.parse()?);
+        let made = match step {
+            "observe" => repeat(time, || batch.observe()),
+            "imagine" => repeat(time, || batch.imagine()),
+            _ => return Err(format!("{step:?} is neither observe nor imagine").into()),
+        };
+        println!("{made}");
+    }
+    Ok(())
+}
+
+impl Batch {
+    /// A batch that has observed one frame and, to be warm, imagined one step.
+    fn new(checkpoint: &Path, rows: i64) -> Result<Self, Box<dyn Error>> {
+        let device = Device::Cpu;
+        let world = GatsbiWorld::load(checkpoint, device)?;
+        let spec = world.spec();
+        let size = spec.image_size;
+        let frame = Tensor::rand([rows, 3, size, size], (Kind::Float, device));
+        let action = Tensor::randn([rows, spec.actions.len() as i64], (Kind::Float, device));
+        let row = |row| RowNoise::Sample { seed: row, sample: 0, step: 1 };
+        let noise = PhiloxNoise::new((0..rows as u64).map(row).collect(), device);
+        let state = world.initial_state(rows);
+        let mut batch = Self { world, state, frame, action, noise };
+        batch.state = batch.observe();
+        batch.imagine();
+        Ok(batch)
+    }
+
+    fn observe(&self) -> State {
+        let Self { world, state, frame, action, noise } = self;
+        world.observe(state, Some(frame), action, noise, Outputs::default()).0
+    }
+
+    fn imagine(&self) -> State {
+        let Self { world, state, action, noise, .. } = self;
+        world.imagine(state, action, noise, Outputs::default()).0
+    }
+}
+
+/// Makes a step as often as there is time for, at least once; returns how often.
+fn repeat(time: Duration, step: impl Fn() -> State) -> u32 {
+    let (began, mut made) = (Instant::now(), 0);
+    while made == 0 || began.elapsed() < time {
+        drop(step());
+        made += 1;
+    }
+    made
+}

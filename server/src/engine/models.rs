@@ -1,0 +1,233 @@
+//! The models of the engine, as everybody else sees them.
+//!
+//! A model is served for as long as anybody holds its [`ModelEntry`]: the catalogue of names, a session, a request
+//! on its way. When the last one lets go, the engine forgets the weights.
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc, Weak,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use gatsbi_models::{
+    noise::PhiloxNoise,
+    scene::Outputs,
+    state::StateRow,
+    world_model::{ModelSpec, WorldModel},
+};
+use tch::{Device, Kind, Tensor};
+use tokio::sync::mpsc;
+
+use super::{commands::Command, scheduler::Sizes};
+
+/// A model to be served.
+pub struct LoadedModel {
+    /// The model.
+    pub world: Box<dyn WorldModel>,
+    /// Name to serve it under.
+    pub name: String,
+    /// Its card, Markdown; empty if it has none.
+    pub card: String,
+}
+
+impl std::fmt::Debug for LoadedModel {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("LoadedModel").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
+/// A model of the engine: unique, and never used again for another one.
+#[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
+pub struct ModelId(pub u64);
+
+/// What the engine tells about a model. Holding on to it keeps the model served.
+#[derive(Debug)]
+pub struct ModelEntry {
+    /// Which.
+    pub id: ModelId,
+    /// What it takes and gives, with the name that it is served under.
+    pub spec: ModelSpec,
+    /// Its card, Markdown; empty if it has none.
+    pub card: String,
+    /// Bytes of a state row.
+    pub row_bytes: usize,
+    /// Where it computes, such as `cpu` or `cuda:0`.
+    pub device: String,
+    /// The state of a session that has seen nothing.
+    pub initial: Arc<StateRow>,
+    pub(super) costs: Costs,
+    engine: mpsc::WeakSender<Command>,
+}
+
+impl Drop for ModelEntry {
+    fn drop(&mut self) {
+        if let Some(engine) = self.engine.upgrade() {
+            // Where there is no room the engine is busy, and looks by itself.
+            engine.try_send(Command::Unused).ok();
+        }
+    }
+}
+
+/// A model on its way to the model's thread.
+pub(super) struct Newcomer {
+    pub(super) entry: Weak<ModelEntry>,
+    pub(super) id: ModelId,
+    pub(super) model: LoadedModel,
+}
+
+impl std::fmt::Debug for Newcomer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Newcomer").field("id", &self.id).finish_non_exhaustive()
+    }
+}
+
+/// What one block of each kind costs, as measured.
+#[derive(Debug)]
+pub(super) struct Costs {
+    pub(super) observe: Cost,
+    pub(super) imagine: Cost,
+}
+
+/// A cost that follows its measurements: an eighth of the way each time, and never by more than a factor of two, so
+/// that a hiccup of the machine does not turn requests away for long.
+#[derive(Debug)]
+pub(super) struct Cost(AtomicU64);
+
+impl Cost {
+    pub(super) fn new(first: Duration) -> Self {
+        Self(AtomicU64::new((first.as_nanos() as u64).max(1)))
+    }
+
+    pub(super) fn get(&self) -> Duration {
+        Duration::from_nanos(self.0.load(Ordering::Relaxed))
+    }
+
+    /// Only the model's thread measures.
+    pub(super) fn measured(&self, cost: Duration) {
+        let old = self.0.load(Ordering::Relaxed);
+        let new = (cost.as_nanos() as u64).clamp(old / 2, old * 2);
+        self.0.store(((old * 7 + new) / 8).max(1), Ordering::Relaxed);
+    }
+}
+
+/// What is told about a model that was warmed up.
+pub(super) fn entry(
+    id: ModelId,
+    model: &LoadedModel,
+    costs: Costs,
+    engine: mpsc::WeakSender<Command>,
+) -> ModelEntry {
+    let initial = model.world.initial_state(1).to_rows().remove(0);
+    let device = match model.world.device() {
+        Device::Cuda(index) => format!("cuda:{index}"),
+        Device::Mps => "mps".to_owned(),
+        Device::Vulkan => "vulkan".to_owned(),
+        Device::Cpu => "cpu".to_owned(),
+    };
+    ModelEntry {
+        id,
+        spec: ModelSpec { name: model.name.clone(), ..model.world.spec().clone() },
+        card: model.card.clone(),
+        row_bytes: model.world.layout().row_bytes(),
+        device,
+        initial: Arc::new(initial),
+        costs,
+        engine,
+    }
+}
+
+/// Makes steps of each kind in the shapes that will be used, so that the first request does not pay for it, and
+/// measures the second ones.
+pub(super) fn warm_up(world: &dyn WorldModel, sizes: Sizes) -> Result<Costs, String> {
+    let steps = || {
+        let _no_grad = tch::no_grad_guard();
+        let device = world.device();
+        let neutral = Tensor::from_slice(&world.spec().neutral_action()).to_device(device);
+        let actions = |rows: i64| neutral.unsqueeze(0).expand([rows, -1], false).contiguous();
+        let (observed, imagined) = (sizes.observe_block as i64, sizes.imagine_block as i64);
+        let size = world.spec().image_size;
+        let frames = Tensor::full([observed, 3, size, size], 0.5, (Kind::Float, device));
+        let observe = |frame: Option<&Tensor>| {
+            let noise = PhiloxNoise::mean(observed, device);
+            let state = world.initial_state(observed);
+            let (state, _) =
+                world.observe(&state, frame, &actions(observed), &noise, Outputs::default());
+            state.to_rows();
+        };
+        let imagine = || {
+            let noise = PhiloxNoise::mean(imagined, device);
+            let state = world.initial_state(imagined);
+            let (state, _) = world.imagine(&state, &actions(imagined), &noise, Outputs::default());
+            state.to_rows();
+        };
+        observe(Some(&frames));
+        observe(None);
+        imagine();
+        Costs { observe: timed(|| observe(Some(&frames))), imagine: timed(imagine) }
+    };
+    let panicked = || format!("{} panicked in its first steps", world.spec().name);
+    catch_unwind(AssertUnwindSafe(steps)).ok().ok_or_else(panicked)
+}
+
+fn timed(step: impl FnOnce()) -> Cost {
+    let began = Instant::now();
+    step();
+    Cost::new(began.elapsed())
+}
+
+/// A model that nobody serves, for tests of what only holds on to one: images of 2 x 2 pixels, no action, and
+/// states of `floats` floats and `ints` integers.
+#[cfg(test)]
+pub(crate) fn made_up(hash: &str, floats: usize, ints: usize) -> Arc<ModelEntry> {
+    let spec = ModelSpec {
+        name: "made up".to_owned(),
+        hash: hash.to_owned(),
+        image_size: 2,
+        preprocess: gatsbi_models::world_model::Preprocess::Stretch,
+        frame_period: None,
+        actions: Vec::new(),
+        slots: 1,
+        agent_slot: None,
+        max_objects: 1,
+        keypoints: None,
+        latents: 1,
+        trained_steps: 0,
+        provenance: String::new(),
+    };
+    let initial = StateRow { floats: vec![0.0; floats].into(), ints: vec![0; ints].into() };
+    let cost = || Cost::new(Duration::from_millis(1));
+    Arc::new(ModelEntry {
+        id: ModelId(0),
+        spec,
+        card: String::new(),
+        row_bytes: 4 * floats + 8 * ints,
+        device: "cpu".to_owned(),
+        initial: Arc::new(initial),
+        costs: Costs { observe: cost(), imagine: cost() },
+        engine: mpsc::channel(1).0.downgrade(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cost_follows_what_lasts_and_not_a_hiccup() {
+        let millis = Duration::from_millis;
+        let cost = Cost::new(millis(16));
+        cost.measured(Duration::from_secs(10));
+        assert_eq!(cost.get(), millis(18));
+        for _ in 0..100 {
+            cost.measured(millis(40));
+        }
+        assert!(cost.get() > millis(39) && cost.get() <= millis(40));
+        for _ in 0..100 {
+            cost.measured(millis(8));
+        }
+        assert!(cost.get() >= millis(8) && cost.get() < millis(9));
+    }
+}

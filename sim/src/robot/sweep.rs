@@ -1,0 +1,177 @@
+//! The script of the robot scenes: pick an object, go behind it, push through it, and again.
+//!
+//! A push begins on the side of the object that is away from the tray's centre, more or less, and ends before the rim:
+//! objects that are squeezed against the rim would jump out. On its way the hand does not go around objects, so it
+//! touches others too.
+
+use std::collections::VecDeque;
+
+use nalgebra::{Vector2, Vector3};
+use rand::{RngExt as _, rngs::ChaCha8Rng};
+use rand_distr::StandardNormal;
+
+use crate::robot::catalogue::{Script, Tray};
+
+/// Tries for a push that keeps every rule.
+const TRIES: usize = 200;
+/// Distance from the object's centre at which a push begins.
+const BEHIND: [f64; 2] = [0.09, 0.13];
+/// Distance that a push keeps from all objects where it begins.
+const CLEARANCE: f64 = 0.07;
+/// The hand keeps this far from the rim.
+pub(crate) const RIM_MARGIN: f64 = 0.035;
+/// An object that is pushed keeps so many of its half sizes from the rim, besides.
+const RIM_HALF_SIZES: f64 = 2.3;
+/// Spread of the direction around the one to the tray's centre, radians, and how it grows from try to try.
+const SPREAD: [f64; 2] = [0.5, 0.02];
+/// Between pushes the hand is faster by this much.
+const APPROACH_FASTER: f64 = 1.3;
+const RISE_FASTER: f64 = 1.2;
+
+/// The script of one episode.
+#[derive(Debug)]
+pub(crate) struct Sweeps {
+    rng: ChaCha8Rng,
+    script: &'static Script,
+    tray: &'static Tray,
+    /// Where the hand goes, and how fast.
+    ways: VecDeque<(Vector3<f64>, f64)>,
+}
+
+impl Sweeps {
+    pub(crate) fn new(rng: ChaCha8Rng, script: &'static Script, tray: &'static Tray) -> Self {
+        Self { rng, script, tray, ways: VecDeque::new() }
+    }
+
+    /// A number of the normal distribution with this spread.
+    pub(crate) fn jitter(&mut self, spread: f64) -> f64 {
+        let normal: f64 = self.rng.sample(StandardNormal);
+        spread * normal
+    }
+
+    /// Where the hand is one period later.
+    pub(crate) fn next(
+        &mut self,
+        mut hand: Vector3<f64>,
+        objects: &[[f64; 3]],
+        half_size: f64,
+        period: f64,
+    ) -> Vector3<f64> {
+        let mut left = period;
+        while left > 1e-9 {
+            let Some(&(goal, speed)) = self.ways.front() else {
+                self.plan(hand, objects, half_size);
+                continue;
+            };
+            let way = goal - hand;
+            let distance = way.norm();
+            if distance <= speed * left {
+                hand = goal;
+                left -= distance / speed;
+                self.ways.pop_front();
+            } else {
+                hand += way / distance * (speed * left);
+                left = 0.0;
+            }
+        }
+        hand
+    }
+
+    fn plan(&mut self, hand: Vector3<f64>, objects: &[[f64; 3]], half_size: f64) {
+        let push = (0..TRIES).find_map(|attempt| self.push(objects, half_size, attempt));
+        let [slow, fast] = self.script.speed;
+        let speed = self.rng.random_range(slow..fast);
+        let (low, high) = (self.script.height, self.script.travel_height);
+        let at = |place: [f64; 2], height| Vector3::new(place[0], place[1], height);
+        if high > low {
+            self.ways.push_back((Vector3::new(hand.x, hand.y, high), RISE_FASTER * speed));
+        }
+        if let Some((start, end)) = push {
+            self.ways.push_back((at(start, high), APPROACH_FASTER * speed));
+            self.ways.push_back((at(start, low), speed));
+            self.ways.push_back((at(end, low), speed));
+        } else {
+            // It looks again from elsewhere.
+            let elsewhere = self.tray.draw(RIM_MARGIN, &mut self.rng);
+            self.ways.push_back((at(elsewhere, high), speed));
+        }
+    }
+
+    /// Start and end of a push through a random object, if it keeps the rules.
+    fn push(
+        &mut self,
+        objects: &[[f64; 3]],
+        half_size: f64,
+        attempt: usize,
+    ) -> Option<([f64; 2], [f64; 2])> {
+        let flat = |at: &[f64; 3]| Vector2::new(at[0], at[1]);
+        let clamp = |at: Vector2<f64>, margin| Vector2::from(self.tray.clamp(at.into(), margin));
+        let object = flat(&objects[self.rng.random_range(0..objects.len())]);
+        let inwards = Vector2::from(self.tray.centre) - object;
+        let angle =
+            inwards.y.atan2(inwards.x) + self.jitter(SPREAD[0] + SPREAD[1] * attempt as f64);
+        let along = Vector2::new(angle.cos(), angle.sin());
+        let behind = object - along * self.rng.random_range(BEHIND[0]..BEHIND[1]);
+        let [least, most] = self.script.sweep;
+        let beyond = object + along * self.rng.random_range(least..most);
+        let start = clamp(behind, RIM_MARGIN);
+        let end = clamp(beyond, RIM_MARGIN + RIM_HALF_SIZES * half_size);
+        let reachable = (start - behind).norm() < 0.01;
+        let forwards = (end - object).dot(&along) > 0.0;
+        let clear = objects.iter().all(|other| (flat(other) - start).norm() > CLEARANCE);
+        (reachable && forwards && clear).then(|| (start.into(), end.into()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng as _;
+
+    use super::*;
+    use crate::{Scene, robot::catalogue::Layout};
+
+    const OBJECTS: [[f64; 3]; 3] = [[0.45, 0.1, 0.03], [0.6, -0.12, 0.03], [0.5, -0.02, 0.03]];
+
+    fn sweeps(scene: Scene, seed: u64) -> Sweeps {
+        let layout = Layout::of(scene).unwrap();
+        Sweeps::new(ChaCha8Rng::seed_from_u64(seed), &layout.script, &layout.tray)
+    }
+
+    #[test]
+    fn the_hand_stays_in_the_tray_and_keeps_its_speed() {
+        for (scene, period) in [(Scene::Push1, 0.2), (Scene::Push2, 0.1)] {
+            let mut sweeps = sweeps(scene, 1);
+            let (script, tray) = (sweeps.script, sweeps.tray);
+            let mut hand = Vector3::new(0.5, 0.0, script.travel_height);
+            for _ in 0..400 {
+                let next = sweeps.next(hand, &OBJECTS, 0.035, period);
+                let fastest = script.speed[1] * APPROACH_FASTER * period;
+                assert!((next - hand).norm() <= fastest + 1e-9);
+                assert!(tray.holds(next.xy().into()));
+                assert!((script.height - 1e-9..=script.travel_height + 1e-9).contains(&next.z));
+                hand = next;
+            }
+        }
+    }
+
+    #[test]
+    fn a_push_goes_through_an_object_and_ends_before_the_rim() {
+        let mut through = 0;
+        for seed in 0..50 {
+            let mut sweeps = sweeps(Scene::Push1, seed);
+            sweeps.plan(Vector3::new(0.4, 0.0, 0.03), &OBJECTS, 0.035);
+            let (end, _) = *sweeps.ways.back().unwrap();
+            let (start, _) = sweeps.ways[sweeps.ways.len() - 2];
+            let margin = RIM_MARGIN + RIM_HALF_SIZES * 0.035;
+            let (at, way) = (end.xy(), (end - start).xy());
+            assert!((Vector2::from(sweeps.tray.clamp(at.into(), margin)) - at).norm() < 1e-12);
+            let passes = |object: &[f64; 3]| {
+                let to = Vector2::new(object[0], object[1]) - start.xy();
+                let along = (to.dot(&way) / way.norm_squared()).clamp(0.0, 1.0);
+                (to - along * way).norm() < 0.035
+            };
+            through += usize::from(OBJECTS.iter().any(passes));
+        }
+        assert!(through >= 48, "{through} of 50 pushes go through an object");
+    }
+}
