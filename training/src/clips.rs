@@ -57,7 +57,8 @@ impl Clips {
             let length = i64::from(data.length);
             let frames = Tensor::from_slice(&data.rgb).view([length, height, width, 3]);
             let frames = frames.permute([0, 3, 1, 2]).contiguous();
-            let actions = Tensor::from_slice(&data.actions).view([length, -1]);
+            let actions =
+                Tensor::from_slice(&data.actions).view([length, info.actions.len() as i64]);
             read.push((frames, actions));
         }
         let median = median(&read);
@@ -80,7 +81,8 @@ impl Clips {
                 name: dimension.name.clone(),
                 unit: dimension.unit.clone(),
                 offset: 0.0,
-                scale: f64::from(std.max(1e-6)),
+                // What never moved says nothing of its range.
+                scale: if *std > 1e-6 { f64::from(*std) } else { 1.0 },
             })
             .collect();
         let scale: Vec<f32> = actions.iter().map(|action| action.scale as f32).collect();
