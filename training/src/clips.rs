@@ -7,9 +7,9 @@ use tch::{Device, Kind, Tensor};
 
 use crate::evaluation::Recorded;
 
-/// Shadows change a channel by less than this. In simulated scenes they make a peak of their own in the histogram
-/// of differences, at 0.11 to 0.13.
-const SHADOW: f64 = 0.145;
+/// Levels (of 255) between which shadows and noise change a channel: their peak in the histogram of differences is
+/// looked for here.
+const SHADOWS: std::ops::Range<usize> = 5..64;
 
 /// Episodes as bytes, with what the trainer derives from them once.
 #[derive(Debug)]
@@ -17,6 +17,8 @@ pub struct Clips {
     episodes: Vec<Episode>,
     /// Per-pixel median over the data set, `[3, H, W]` in [0, 1].
     pub median: Tensor,
+    /// Differences up to this count as shadow or noise, in [0, 1]; found in the data.
+    pub shadow: f64,
     /// Scaling of the actions.
     pub actions: Vec<ActionDimension>,
     /// Seconds between frames.
@@ -62,12 +64,13 @@ impl Clips {
             read.push((frames, actions));
         }
         let median = median(&read);
+        let shadow = shadow_threshold(&read, &median);
         let episodes: Vec<Episode> = read
             .into_iter()
             .map(|(frames, actions)| {
                 let own = frames.median_dim(0, false).0;
-                let foreground = difference_map(&frames, &median);
-                let motion = foreground.minimum(&difference_map(&frames, &own));
+                let foreground = difference_map(&frames, &median, shadow);
+                let motion = foreground.minimum(&difference_map(&frames, &own, shadow));
                 Episode { frames, foreground, motion, actions }
             })
             .collect();
@@ -89,6 +92,7 @@ impl Clips {
         Ok(Self {
             episodes,
             median: median.to_kind(Kind::Float) / 255.0,
+            shadow,
             actions,
             frame_period: info.frame_period_seconds,
             scale: Tensor::from_slice(&scale),
@@ -161,23 +165,71 @@ impl Clips {
     }
 }
 
-/// Per-pixel median over a sample of frames, `[3, H, W]` u8.
-fn median(episodes: &[(Tensor, Tensor)]) -> Tensor {
+/// Every sixth frame of about a hundred episodes, `[N, 3, H, W]` u8.
+fn sample(episodes: &[(Tensor, Tensor)]) -> Tensor {
     let every = episodes.len().div_ceil(100).max(1);
     let sample: Vec<Tensor> = episodes
         .iter()
         .step_by(every)
         .map(|(frames, _)| frames.slice(0, 0, frames.size()[0], 6))
         .collect();
-    Tensor::cat(&sample, 0).median_dim(0, false).0
+    Tensor::cat(&sample, 0)
+}
+
+/// Per-pixel median over a sample of frames, `[3, H, W]` u8.
+fn median(episodes: &[(Tensor, Tensor)]) -> Tensor {
+    sample(episodes).median_dim(0, false).0
+}
+
+/// The foot behind the peak that shadows and noise make in the histogram of differences from the median, in [0, 1].
+/// Arm and objects differ by anything and make no peak of their own.
+fn shadow_threshold(episodes: &[(Tensor, Tensor)], median: &Tensor) -> f64 {
+    let levels = differences(&sample(episodes), median).round().to_kind(Kind::Int64);
+    let counts = levels.flatten(0, -1).bincount::<Tensor>(None, 256).to_kind(Kind::Float);
+    let counts: Vec<f32> = Vec::try_from(counts).expect("counts are one-dimensional");
+    foot(&counts) as f64 / 255.0
+}
+
+/// The level where a histogram, smoothed over five levels, stops falling behind its highest peak in `SHADOWS`.
+fn foot(counts: &[f32]) -> usize {
+    let smooth = |level: usize| counts[level - 2..=level + 2].iter().sum::<f32>();
+    let peak =
+        SHADOWS.max_by(|a, b| smooth(*a).total_cmp(&smooth(*b))).expect("the levels are not empty");
+    (peak..counts.len() - 3)
+        .find(|level| smooth(level + 1) >= smooth(*level))
+        .unwrap_or(counts.len() - 3)
+}
+
+/// Largest difference of a channel, `[T, H, W]` in [0, 255], of frames `[T, 3, H, W]` from an image.
+fn differences(frames: &Tensor, image: &Tensor) -> Tensor {
+    let float = |x: &Tensor| x.to_kind(Kind::Float);
+    (float(frames) - float(image)).abs().amax(1, false)
 }
 
 /// Where frames `[T, 3, H, W]` differ from an image, more than shadows do, holes of a pixel filled, `[T, H, W]` u8.
-fn difference_map(frames: &Tensor, image: &Tensor) -> Tensor {
-    let float = |x: &Tensor| x.to_kind(Kind::Float);
-    let difference = (float(frames) - float(image)).abs().amax(1, false) / 255.0;
-    let map = ((difference - SHADOW) * 40.0).sigmoid().unsqueeze(1);
+fn difference_map(frames: &Tensor, image: &Tensor, shadow: f64) -> Tensor {
+    let difference = differences(frames, image) / 255.0;
+    let map = ((difference - shadow) * 40.0).sigmoid().unsqueeze(1);
     let spread = |x: &Tensor| x.max_pool2d([3, 3], [1, 1], [1, 1], [1, 1], false);
     let closed = -spread(&-spread(&map));
     (closed.squeeze_dim(1) * 255.0).round().to_kind(Kind::Uint8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_shadow_threshold_is_the_foot_behind_the_shadows_peak() {
+        // Noise at 0, shadows around 30, everything else flat.
+        let counts: Vec<f32> = (0..256)
+            .map(|level| {
+                let bump = |at: f32, width: f32| (-((level as f32 - at) / width).powi(2)).exp();
+                1e6 * bump(0.0, 1.5) + 1e5 * bump(30.0, 3.0) + 500.0 - level as f32 * 0.01
+                    + if level >= 40 { 100.0 } else { 0.0 }
+            })
+            .collect();
+        let foot = foot(&counts);
+        assert!((36..=42).contains(&foot), "{foot}");
+    }
 }

@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::{Context as _, bail, ensure};
-use clap::{Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
 use gatsbi_episodes::Dataset;
 use gatsbi_models::{
     checkpoint::{Checkpoint, Precision},
@@ -18,7 +18,13 @@ use gatsbi_models::{
 };
 use gatsbi_training::{
     clips::Clips,
-    evaluation::{CONDITIONING, Recorded, picture, report::report, rollout, wanted},
+    evaluation::{
+        CONDITIONING, Draw, Recorded,
+        perceptual::Perceptual,
+        picture, plot,
+        report::{Protocol, report},
+        rollout, wanted,
+    },
     recipe::Recipe,
     trainer::Trainer,
     untrained,
@@ -86,13 +92,33 @@ enum Command {
         /// Episodes from and up to (excluded).
         #[arg(long, num_args = 2)]
         range: Option<Vec<usize>>,
-        /// File for all numbers.
-        #[arg(long)]
-        json: Option<PathBuf>,
-        /// Picture of three episodes.
-        #[arg(long)]
-        picture: Option<PathBuf>,
+        #[command(flatten)]
+        evaluation: Evaluation,
     },
+}
+
+/// What an evaluation measures, and what it leaves.
+#[derive(Args, Debug)]
+struct Evaluation {
+    /// Sampled rollouts of each episode, of which the best counts.
+    #[arg(long, default_value_t = 10)]
+    samples: u32,
+    /// Weights of the perceptual metrics, from `cargo xtask metrics`: adds ST-LPIPS and the Fréchet video distance,
+    /// which takes minutes.
+    #[arg(long)]
+    perceptual: Option<PathBuf>,
+    /// File for all numbers.
+    #[arg(long)]
+    json: Option<PathBuf>,
+    /// File for the numbers of each imagined step.
+    #[arg(long)]
+    csv: Option<PathBuf>,
+    /// SVG of the numbers over imagined steps.
+    #[arg(long)]
+    plot: Option<PathBuf>,
+    /// Picture of three episodes.
+    #[arg(long)]
+    picture: Option<PathBuf>,
 }
 
 fn main() -> anyhow::Result<()> {
@@ -121,9 +147,9 @@ fn main() -> anyhow::Result<()> {
             }
             trainer.run(&clips, None)?;
         }
-        Command::Eval { checkpoint, episodes, range, json, picture } => {
+        Command::Eval { checkpoint, episodes, range, evaluation } => {
             tch::set_num_threads(1);
-            evaluate(&checkpoint, &episodes, range, json.as_deref(), picture.as_deref())?;
+            evaluate(&checkpoint, &episodes, range, &evaluation)?;
         }
     }
     Ok(())
@@ -155,28 +181,39 @@ fn evaluate(
     checkpoint: &Path,
     episodes: &Path,
     range: Option<Vec<usize>>,
-    json: Option<&Path>,
-    picture: Option<&Path>,
+    wants: &Evaluation,
 ) -> anyhow::Result<()> {
     let world = GatsbiWorld::load(checkpoint, Device::Cpu)?;
     let dataset = Dataset::open(episodes)?;
     let range = episodes_in(&dataset, range)?;
     let bar = ProgressBar::new(range.len() as u64);
-    let report = report(&world, &dataset, range.clone(), HORIZON, |done| bar.inc(done as u64))?;
+    let perceptual = wants.perceptual.as_deref().map(|path| Perceptual::load(path, Device::Cpu));
+    let perceptual = perceptual.transpose()?;
+    let protocol =
+        Protocol { horizon: HORIZON, samples: wants.samples, perceptual: perceptual.as_ref() };
+    let report = report(&world, &dataset, range.clone(), protocol, |done| bar.inc(done as u64))?;
     bar.finish_and_clear();
     println!("{} on {}", report.model["name"], report.data);
     for (name, value) in report.numbers.iter().filter(|(name, _)| !name.ends_with("_ci95")) {
-        println!("{name:<28} {value:>9.4} ± {:.4}", report.numbers[&format!("{name}_ci95")]);
+        let interval = report.numbers.get(&format!("{name}_ci95"));
+        let interval = interval.map(|half| format!(" ± {half:.4}")).unwrap_or_default();
+        println!("{name:<28} {value:>9.4}{interval}");
     }
-    if let Some(path) = json {
+    if let Some(path) = &wants.json {
         fs_err::write(path, serde_json::to_string_pretty(&report)?)?;
     }
-    if let Some(path) = picture {
+    if let Some(path) = &wants.csv {
+        fs_err::write(path, report.csv())?;
+    }
+    if let Some(path) = &wants.plot {
+        plot::write(path, &report)?;
+    }
+    if let Some(path) = &wants.picture {
         let episodes: Vec<usize> = range.step_by(3).take(3).collect();
         let neutral = world.spec().neutral_action();
         let length = CONDITIONING + HORIZON;
         let recorded = Recorded::read(&dataset, &episodes, length, &neutral, Device::Cpu)?;
-        let scenes = rollout(&world, &recorded, &recorded.actions, wanted());
+        let scenes = rollout(&world, &recorded, &recorded.actions, Draw::Mean, wanted());
         picture::write(path, &recorded, &scenes, world.spec().agent_slot, 1)?;
     }
     Ok(())

@@ -6,8 +6,8 @@ use gatsbi_models::{
         keypoint::{KeypointLearning, Keypoints},
         loss,
         mixture::MixtureStep,
-        model::{Gatsbi, GatsbiStep, GradientStops, Observing},
-        objects::{Discover, Rendering},
+        model::{Gatsbi, GradientStops, Observing},
+        objects::{Discover, ObjectStep, Rendering},
     },
     noise::{Noise, PhiloxNoise, RowNoise, Site, philox4x32_10},
 };
@@ -15,7 +15,7 @@ use tch::{Device, Kind, Tensor};
 
 use crate::{
     clips::Batch,
-    recipe::{KeypointRecipe, ObjectRecipe, Ramp, Recipe, RegressionRecipe},
+    recipe::{KeypointRecipe, MixtureRecipe, ObjectRecipe, Ramp, Recipe, RegressionRecipe},
 };
 
 /// Where a run is: everything random about a step is a function of this.
@@ -175,6 +175,8 @@ fn add_scene(
     let device = batch.frames[0].device();
     let objects = recipe.objects.as_ref().filter(|objects| moment.step >= objects.start);
     let alone = recipe.objects_alone(moment.step);
+    let tracking = training_tracking(objects.and_then(|objects| objects.scale_bounds));
+    let observed = batch.frames.len() - recipe.imagined.at(moment.step) as usize;
     let mut state = model.initial_state(rows);
     for (t, frame) in batch.frames.iter().enumerate() {
         let first = state.first();
@@ -186,17 +188,25 @@ fn add_scene(
             priors: !alone,
             objects: objects.is_some(),
             discover,
-            tracking: training_tracking(objects.and_then(|objects| objects.scale_bounds)),
+            tracking,
             stops: GradientStops::default(),
         };
         let noise = DampedNoise {
             noise: noise(moment, t, rows, device),
             factor: recipe.mixture.noise.at(moment.step),
         };
-        let (next, seen) = model.observe(state, frame, &batch.actions[t], &noise, how);
+        let (next, seen) = if t < observed {
+            model.observe(state, frame, &batch.actions[t], &noise, how)
+        } else {
+            model.imagine(state, &batch.actions[t], &noise, &tracking)
+        };
         state = next;
+        let phase = if t < observed { Phase::Observed } else { Phase::Imagined };
         if !alone {
-            add_mixture(terms, recipe, &seen.mixture, frame, &first, moment.step);
+            add_mixture(terms, &recipe.mixture, &seen.mixture, frame, moment.step, phase);
+            if phase == Phase::Observed {
+                add_mixture_kl(terms, &recipe.mixture, &seen.mixture, &first, moment.step);
+            }
         }
         let rendering = objects.map(|_| model.render(&state));
         let maps = Maps {
@@ -208,7 +218,26 @@ fn add_scene(
         let alpha = rendering.as_ref().map(|rendering| &rendering.alpha);
         add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
         if let (Some(objects), Some(rendering)) = (objects, &rendering) {
-            add_objects(terms, model, objects, rendering, &seen, frame, &first, moment.step);
+            add_composite(terms, objects, rendering, &seen.mixture, frame, moment.step, phase);
+            if let Some(found) = &seen.objects {
+                add_objects_kl(terms, model, objects, found, &first, moment.step);
+            }
+        }
+    }
+}
+
+/// Whether a frame was shown to the model or left to its priors; terms of both are told apart in the journal.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Phase {
+    Observed,
+    Imagined,
+}
+
+impl Phase {
+    fn name(self, observed: &'static str, imagined: &'static str) -> &'static str {
+        match self {
+            Self::Observed => observed,
+            Self::Imagined => imagined,
         }
     }
 }
@@ -252,38 +281,43 @@ fn add_regression(
 
 fn add_mixture(
     terms: &mut Terms,
-    recipe: &Recipe,
+    recipe: &MixtureRecipe,
     mixture: &MixtureStep,
     frame: &Tensor,
+    step: u64,
+    phase: Phase,
+) {
+    let weight = recipe.likelihood.at(step);
+    if weight > 0.0 {
+        let (masks, components) = (&mixture.log_masks, &mixture.components);
+        let likelihood = loss::mixture_log_likelihood(frame, masks, components, recipe.sigma);
+        terms.add(phase.name("nll_mixture", "nll_mixture_imagined"), -likelihood, weight);
+    }
+}
+
+fn add_mixture_kl(
+    terms: &mut Terms,
+    recipe: &MixtureRecipe,
+    mixture: &MixtureStep,
     first: &Tensor,
     step: u64,
 ) {
-    let recipe = &recipe.mixture;
     let (mask, comp) = loss::mixture_kl(mixture);
     let kl = recipe.kl.at(step);
     terms.add("kl_mask", mask, kl);
     terms.add("kl_comp", comp, kl);
     terms.add("residual", loss::residual_norm(mixture, first), recipe.residual);
-    let weight = recipe.likelihood.at(step);
-    if weight > 0.0 {
-        let (masks, components) = (&mixture.log_masks, &mixture.components);
-        let likelihood = loss::mixture_log_likelihood(frame, masks, components, recipe.sigma);
-        terms.add("nll_mixture", -likelihood, weight);
-    }
 }
 
-#[expect(clippy::too_many_arguments, reason = "a step and its weights")]
-fn add_objects(
+fn add_composite(
     terms: &mut Terms,
-    model: &Gatsbi,
     recipe: &ObjectRecipe,
     rendering: &Rendering,
-    seen: &GatsbiStep,
+    mixture: &MixtureStep,
     frame: &Tensor,
-    first: &Tensor,
     step: u64,
+    phase: Phase,
 ) {
-    let mixture = &seen.mixture;
     let window = recipe.fixed_alpha.filter(|window| step < window.end);
     let weight = recipe.composite.at(step);
     if weight > 0.0 {
@@ -294,7 +328,7 @@ fn add_objects(
             None => rendering.over(&mixture.mu_mix),
         };
         let likelihood = loss::gaussian_log_likelihood(frame, &image, recipe.sigma);
-        terms.add("nll", -likelihood, weight);
+        terms.add(phase.name("nll", "nll_imagined"), -likelihood, weight);
     }
     let weight = recipe.joint.at(step);
     if weight > 0.0 {
@@ -310,21 +344,30 @@ fn add_objects(
             &mixture.components,
             recipe.sigma,
         );
-        terms.add("nll_joint", -likelihood, weight);
+        terms.add(phase.name("nll_joint", "nll_joint_imagined"), -likelihood, weight);
     }
+    let alpha = rendering.alpha.mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
+    terms.add("alpha", alpha, 0.0);
+}
+
+fn add_objects_kl(
+    terms: &mut Terms,
+    model: &Gatsbi,
+    recipe: &ObjectRecipe,
+    found: &ObjectStep,
+    first: &Tensor,
+    step: u64,
+) {
     let config = &model.config().objects;
     let mut prior = config.prior.clone();
     prior.scale_mean = recipe.scale_mean.at(step);
-    let objects = seen.objects.as_ref().expect("objects were observed");
-    let kl = objects.kl(first, &prior, config.aux_presence_kl);
+    let kl = found.kl(first, &prior, config.aux_presence_kl);
     let weight = recipe.kl.at(step);
     terms.add("kl_pres", kl.pres, weight);
     terms.add("kl_where", kl.place, weight);
     terms.add("kl_depth", kl.depth, weight);
     terms.add("kl_what", kl.what, weight);
     terms.add("kl_dyna", kl.dyna, weight);
-    let alpha = rendering.alpha.mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
-    terms.add("alpha", alpha, 0.0);
 }
 
 /// Whether discovery is dropped at frame `t`, for the whole batch.

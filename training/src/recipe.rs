@@ -32,6 +32,10 @@ pub struct Recipe {
     pub batch: i64,
     /// Frames per sequence, from the given step on.
     pub length: Staircase,
+    /// Frames at the end of a sequence that are imagined instead of observed, from the given step on. KL terms teach
+    /// priors one step ahead; this teaches what they become when they follow each other.
+    #[serde(default)]
+    pub imagined: Staircase,
     /// Learning rate, from the given step on.
     pub learning_rate: Staircase,
     /// Largest global norm of a gradient.
@@ -71,20 +75,29 @@ impl Recipe {
         let recipe: Self = toml::from_str(text)?;
         ensure!(recipe.steps > 0, "steps is 0, expected at least 1");
         ensure!(recipe.batch > 0, "batch is {}, expected at least 1", recipe.batch);
-        for (field, staircase) in
-            [("length", &recipe.length), ("learning_rate", &recipe.learning_rate)]
-        {
+        let everywhere = [("length", &recipe.length), ("learning_rate", &recipe.learning_rate)];
+        for (field, staircase) in everywhere.into_iter().chain([("imagined", &recipe.imagined)]) {
+            ensure!(
+                staircase.0.is_sorted_by(|(a, _), (b, _)| a < b),
+                "the steps of {field} do not increase"
+            );
+        }
+        for (field, staircase) in everywhere {
             ensure!(
                 staircase.0.first().is_some_and(|(step, _)| *step == 0),
                 "{field} does not begin with step 0"
             );
             ensure!(
-                staircase.0.is_sorted_by(|(a, _), (b, _)| a < b),
-                "the steps of {field} do not increase"
-            );
-            ensure!(
                 staircase.0.iter().all(|(_, value)| *value > 0.0),
                 "{field} has a value that is not positive"
+            );
+        }
+        for (step, imagined) in &recipe.imagined.0 {
+            ensure!(
+                *imagined < recipe.length.at(*step),
+                "{imagined} of {} frames are imagined from step {step} on, expected one observed at \
+                 least",
+                recipe.length.at(*step)
             );
         }
         Ok(recipe)
@@ -106,7 +119,7 @@ impl Recipe {
     pub fn rate_of(&self, name: &str, step: u64) -> f64 {
         let rate = self.learning_rate.at(step);
         match &self.objects {
-            Some(objects) if name.starts_with("objects.") => rate * objects.rate,
+            Some(objects) if name.starts_with("objects.") => rate * objects.rate.at(step),
             _ if self.objects_alone(step) => 0.0,
             _ => rate,
         }
@@ -167,7 +180,7 @@ pub struct ObjectRecipe {
     /// Up to this step nothing but the objects learns.
     pub alone_until: u64,
     /// Factor on the learning rate of the object module.
-    pub rate: f64,
+    pub rate: Ramp,
     /// Bounds of a box's side as a fraction of the image. Without them a few faint boxes grow over the whole
     /// image and correct the background's colours, instead of being objects.
     pub scale_bounds: Option<(f64, f64)>,
@@ -244,14 +257,14 @@ impl Ramp {
 }
 
 /// A number that changes at given steps: `[step, value]` pairs by increasing step.
-#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
 pub struct Staircase(Vec<(u64, f64)>);
 
 impl Staircase {
-    /// The value at `step`.
+    /// The value at `step`; 0 before the first one.
     pub fn at(&self, step: u64) -> f64 {
         let after = self.0.partition_point(|(at, _)| *at <= step);
-        self.0[after.saturating_sub(1)].1
+        after.checked_sub(1).map_or(0.0, |last| self.0[last].1)
     }
 }
 
@@ -291,6 +304,10 @@ mod tests {
                 "length does not begin with step 0",
             ),
             (tiny.replace("clip = ", "clap = "), "unknown field `clap`"),
+            (
+                tiny.replace("imagined = ", "imagined = [[0, 3]] # "),
+                "3 of 3 frames are imagined from step 0 on",
+            ),
         ];
         for (text, expected) in wrong {
             let error = format!("{:#}", Recipe::parse(&text).unwrap_err());

@@ -23,7 +23,7 @@ use tch::{Device, Kind};
 use crate::{
     adam::{self, Adam},
     clips::{Batch, Clips},
-    evaluation::{self, Recorded},
+    evaluation::{self, Draw, Recorded},
     journal::Journal,
     objective::{Moment, noise, objective, training_tracking},
     recipe::Recipe,
@@ -143,6 +143,7 @@ impl Trainer {
         let end = until.map_or(self.recipe.steps, |until| until.min(self.recipe.steps));
         let mut journal = Journal::start(&self.folder, self.progress.step, self.recipe.steps)?;
         if self.progress.step == 0 {
+            journal.say(&format!("differences up to {:.3} count as shadow", clips.shadow));
             self.prefit(clips, &journal);
         }
         let mut skipped_in_a_row = 0;
@@ -310,8 +311,13 @@ impl Trainer {
         self.export()?;
         let world = GatsbiWorld::load(&self.checkpoint_path(), self.device)?;
         let recorded: Recorded = clips.recorded(&[0, clips.len() / 2], 20, self.device);
-        let scenes =
-            evaluation::rollout(&world, &recorded, &recorded.actions, evaluation::wanted());
+        let scenes = evaluation::rollout(
+            &world,
+            &recorded,
+            &recorded.actions,
+            Draw::Mean,
+            evaluation::wanted(),
+        );
         let path = self.folder.join(format!("step-{:07}.png", self.progress.step));
         let agent = world.spec().agent_slot;
         evaluation::picture::write(&path, &recorded, &scenes, agent, 1)?;

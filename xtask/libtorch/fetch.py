@@ -1,6 +1,6 @@
 """Provides the files of a recipe: finds its wheels through pip, downloads and checks them, unpacks what is named.
 
-Usage: python3 - RECIPE DOWNLOADS TARGET      (RECIPE is the text of cpu.json or cuda.json)
+Usage: python3 - RECIPE DOWNLOADS TARGET      (RECIPE is the text of a recipe such as cpu.json)
 
 pip is asked where a wheel lies, so its index, credentials, proxy and certificates apply; it is not asked to
 fetch it, because it cannot resume a broken transfer and its dry run downloads the whole wheel unseen. A run
@@ -22,6 +22,7 @@ import shutil
 import ssl
 import subprocess
 import sys
+import tarfile
 import time
 import urllib.error
 import urllib.request
@@ -179,6 +180,8 @@ def download(wheel, url, part):
 def download_with_pip(wheel, refusal, part):
     """Lets pip itself fetch the wheel: not resumable, but with whatever opens the index to it."""
     say(f"the direct download is refused ({refusal}): leaving it to pip")
+    if not wheel["file"].endswith(".whl"):
+        raise Failure(f"the package index refuses {wheel['file']} ({refusal})")
     tags = wheel["file"][: -len(".whl")].split("-")
     wanted = ("--python-version", "3.11", "--implementation", "cp", "--abi", "cp311")
     platform = ("--platform", tags[-1].split(".")[0])
@@ -192,16 +195,26 @@ def download_with_pip(wheel, refusal, part):
 
 def unpack(wheel, part, target):
     say(f"unpacking {wheel['file']}")
-    with zipfile.ZipFile(part) as archive:
-        for prefix, destination in wheel["members"].items():
-            names = [n for n in archive.namelist() if n.startswith(prefix) and not n.endswith("/")]
-            if not names:
-                raise Failure(f"{wheel['file']} holds no {prefix}")
-            for name in names:
-                path = target / (destination + name[len(prefix) :])
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with archive.open(name) as source, path.open("wb") as file:
-                    shutil.copyfileobj(source, file, MIB)
+    if wheel["file"].endswith(".tar.gz"):
+        with tarfile.open(part, "r:gz") as archive:
+            names = [member.name for member in archive.getmembers() if member.isfile()]
+            unpack_members(wheel, names, archive.extractfile, target)
+    else:
+        with zipfile.ZipFile(part) as archive:
+            names = [name for name in archive.namelist() if not name.endswith("/")]
+            unpack_members(wheel, names, archive.open, target)
+
+
+def unpack_members(wheel, names, open_member, target):
+    for prefix, destination in wheel["members"].items():
+        wanted = [name for name in names if name.startswith(prefix)]
+        if not wanted:
+            raise Failure(f"{wheel['file']} holds no {prefix}")
+        for name in wanted:
+            path = target / (destination + name[len(prefix) :])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open_member(name) as source, path.open("wb") as file:
+                shutil.copyfileobj(source, file, MIB)
 
 
 class Progress:

@@ -9,6 +9,7 @@ mod bench;
 mod cargo;
 mod demo;
 mod libtorch;
+mod metrics;
 mod mujoco;
 mod process;
 mod setup;
@@ -25,9 +26,9 @@ use crate::setup::Variant;
 #[derive(Parser)]
 #[command(bin_name = "cargo xtask", about = "The project's automation", version = None)]
 enum Command {
-    /// Provide libtorch 2.11.0 and point .libtorch at it
+    /// Provide libtorch 2.11.0 and MuJoCo 3.17.0, and point .libtorch and .mujoco at them
     ///
-    /// It is downloaded once into GATSBI_CACHE (else XDG_CACHE_HOME/gatsbi, else ~/.cache/gatsbi) through pip's
+    /// They are downloaded once into GATSBI_CACHE (else XDG_CACHE_HOME/gatsbi, else ~/.cache/gatsbi) through pip's
     /// settings; an interrupted set-up continues where it stopped. A libtorch of your own, named by LIBTORCH
     /// or LIBTORCH_USE_PYTORCH, is checked and used instead.
     Setup {
@@ -64,6 +65,8 @@ enum Command {
     ///
     /// Both have the same weights and take turns, so that what else the machine does hits both; rely on the ratios.
     Bench(bench::Arguments),
+    /// Provide the pretrained networks of the perceptual metrics (110 MB to download); prints the file for gatsbi-train eval
+    Metrics,
     /// Format the sources
     Fmt,
 }
@@ -90,6 +93,7 @@ fn run(command: Command) -> Result<()> {
         Command::Lint => cargo::lint(root),
         Command::Twin { presets } => twin::agree(root, &presets),
         Command::Bench(arguments) => bench::bench(root, &arguments),
+        Command::Metrics => metrics::provide(),
         Command::Fmt => cargo::fmt(root),
     }
 }

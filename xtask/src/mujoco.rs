@@ -9,7 +9,6 @@ use std::env::consts::{ARCH, OS};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, ensure};
-use fs_err as fs;
 
 use crate::setup;
 
@@ -46,7 +45,7 @@ pub(crate) fn set_up(root: &Path) -> Result<()> {
     }
     let cache = setup::cache()?;
     let folder = cache.join(format!("mujoco-{VERSION}"));
-    provide(&cache, &folder)?;
+    setup::fill(&cache, &folder, RECIPE, |_| Ok(()))?;
     setup::replace_link(&root.join(LINK), &folder.join("mujoco"))
 }
 
@@ -56,30 +55,10 @@ fn of_the_user(root: &Path, named: Option<PathBuf>) -> Option<PathBuf> {
     named.filter(|folder| ours.is_none() || folder.canonicalize().ok() != ours)
 }
 
-fn provide(cache: &Path, folder: &Path) -> Result<()> {
-    let made_by = folder.join("recipe.json");
-    let is_complete = || fs::read_to_string(&made_by).is_ok_and(|recipe| recipe == RECIPE);
-    if is_complete() {
-        return Ok(());
-    }
-    fs::create_dir_all(cache)?;
-    let _lock = setup::lock(cache)?;
-    if is_complete() {
-        return Ok(());
-    }
-    let unfinished = cache.join(format!("mujoco-{VERSION}.unfinished"));
-    setup::fetch(RECIPE, &cache.join("downloads"), &unfinished)?;
-    fs::write(unfinished.join("recipe.json"), RECIPE)?;
-    if folder.exists() {
-        fs::remove_dir_all(folder)?;
-    }
-    fs::rename(unfinished, folder)?;
-    eprintln!("MuJoCo {VERSION} is ready: {}", folder.display());
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
+    use fs_err as fs;
+
     use super::*;
 
     #[test]

@@ -57,7 +57,7 @@ impl Variant {
     }
 
     fn is_complete_in(self, folder: &Path) -> bool {
-        fs::read_to_string(folder.join(RECIPE)).is_ok_and(|made_by| made_by == self.recipe())
+        is_made_by(folder, self.recipe())
     }
 }
 
@@ -97,25 +97,48 @@ fn provide(variant: Variant, cache: &Path, folder: &Path) -> Result<()> {
     }
     check_platform(OS, ARCH, cfg!(target_env = "gnu"))?;
     check_compiler()?;
-    fs::create_dir_all(cache)?;
-    let _lock = lock(cache)?;
-    if variant.is_complete_in(folder) {
+    fill(cache, folder, variant.recipe(), |unfinished| {
+        let torch = unfinished.join("torch");
+        if !torch.join("lib/libtorch.so").exists() {
+            make_libtorch_so(&torch.join("lib"))?;
+        }
+        fs::write(torch.join("build-version"), format!("{VERSION}\n"))?;
+        libtorch::check(&torch, &torch)
+    })
+}
+
+/// Makes `folder` in the cache from a recipe, unless it is there: downloads, lets `finish` work on what was unpacked,
+/// and gives it its name when it is whole.
+pub(crate) fn fill(
+    cache: &Path,
+    folder: &Path,
+    recipe: &str,
+    finish: impl FnOnce(&Path) -> Result<()>,
+) -> Result<()> {
+    let is_complete = || is_made_by(folder, recipe);
+    if is_complete() {
         return Ok(());
     }
-    let unfinished = cache.join(format!("libtorch-{VERSION}-{}.unfinished", variant.name()));
-    fetch(variant.recipe(), &cache.join("downloads"), &unfinished)?;
-    let torch = unfinished.join("torch");
-    if !torch.join("lib/libtorch.so").exists() {
-        make_libtorch_so(&torch.join("lib"))?;
+    fs::create_dir_all(cache)?;
+    let _lock = lock(cache)?;
+    if is_complete() {
+        return Ok(());
     }
-    fs::write(torch.join("build-version"), format!("{VERSION}\n"))?;
-    libtorch::check(&torch, &torch)?;
-    fs::write(unfinished.join(RECIPE), variant.recipe())?;
+    let unfinished = folder.with_added_extension("unfinished");
+    fetch(recipe, &cache.join("downloads"), &unfinished)?;
+    finish(&unfinished)?;
+    fs::write(unfinished.join(RECIPE), recipe)?;
     if folder.exists() {
         fs::remove_dir_all(folder)?;
     }
     fs::rename(unfinished, folder)?;
+    eprintln!("{} is ready", folder.display());
     Ok(())
+}
+
+/// Whether a folder was made, and finished, from that recipe.
+fn is_made_by(folder: &Path, recipe: &str) -> bool {
+    fs::read_to_string(folder.join(RECIPE)).is_ok_and(|made_by| made_by == recipe)
 }
 
 fn check_platform(os: &str, arch: &str, glibc: bool) -> Result<()> {

@@ -2,14 +2,16 @@
 
 pub mod decomposition;
 pub mod images;
+pub mod perceptual;
 pub mod picture;
+pub mod plot;
 pub mod report;
 pub mod statistics;
 
 use anyhow::Context as _;
 use gatsbi_episodes::{Dataset, Episode};
 use gatsbi_models::{
-    noise::PhiloxNoise,
+    noise::{PhiloxNoise, RowNoise},
     scene::{Output, Outputs, Scene},
     world_model::WorldModel,
 };
@@ -71,18 +73,45 @@ impl Recorded {
     }
 }
 
-/// Observes the first frames and imagines the rest in mean mode, with `actions` from then on.
+/// What latents are drawn with.
+#[derive(Clone, Copy, Debug)]
+pub enum Draw {
+    /// Means of all distributions.
+    Mean,
+    /// One of several samples; rows of a batch have seeds of their own, from `seed` on.
+    Sample {
+        /// Seed of the first row.
+        seed: u64,
+        /// Index of the sample.
+        sample: u32,
+    },
+}
+
+impl Draw {
+    fn noise(self, batch: i64, t: usize, device: Device) -> PhiloxNoise {
+        match self {
+            Self::Mean => PhiloxNoise::mean(batch, device),
+            Self::Sample { seed, sample } => {
+                let row = |row| RowNoise::Sample { seed: seed + row, sample, step: t as u64 };
+                PhiloxNoise::new((0..batch as u64).map(row).collect(), device)
+            }
+        }
+    }
+}
+
+/// Observes the first frames and imagines the rest, with `actions` from then on.
 pub fn rollout(
     world: &dyn WorldModel,
     recorded: &Recorded,
     actions: &[Tensor],
+    draw: Draw,
     wanted: Outputs,
 ) -> Vec<Scene> {
     let batch = recorded.frames[0].size()[0];
-    let noise = PhiloxNoise::mean(batch, world.device());
     let mut state = world.initial_state(batch);
     let mut scenes = Vec::new();
     for (t, action) in actions.iter().enumerate() {
+        let noise = draw.noise(batch, t, world.device());
         let (next, scene) = if t < CONDITIONING {
             world.observe(&state, Some(&recorded.frames[t]), action, &noise, wanted)
         } else {

@@ -1,20 +1,31 @@
 //! The evaluation of a checkpoint on a data set, as numbers.
 
-use std::{collections::BTreeMap, ops::Range};
+use std::{
+    collections::{BTreeMap, HashMap},
+    ops::Range,
+};
 
 use gatsbi_episodes::Dataset;
-use gatsbi_models::{scene::Scene, world_model::WorldModel};
+use gatsbi_models::{
+    scene::{Output, Outputs, Scene},
+    world_model::WorldModel,
+};
 use serde::Serialize;
 use tch::Tensor;
 
 use super::{
-    CONDITIONING, Recorded, decomposition, images, rollout,
+    CONDITIONING, Draw, Recorded, decomposition, images,
+    perceptual::{Perceptual, frechet_distance},
+    rollout,
     statistics::{Estimate, PerEpisode},
     wanted,
 };
 
 /// Imagined steps from which swapped actions are expected to show.
 const ACTIONS_MATTER_FROM: usize = 5;
+
+/// Seed of sampled rollouts; the number of the episode is added.
+const SEED: u64 = 0x6761_7473_6269;
 
 /// Episodes that are rolled out together.
 const BATCH: usize = 10;
@@ -30,16 +41,70 @@ pub struct Report {
     pub episodes: usize,
     /// Imagined steps.
     pub horizon: usize,
-    /// Numbers by name; `NAME_ci95` is half the width of the 95 % interval over episodes.
+    /// Sampled rollouts of each episode.
+    pub samples: u32,
+    /// Numbers by name; `NAME_ci95` is half the width of the 95 % interval over episodes, where there is one.
     pub numbers: BTreeMap<String, f64>,
     /// Image metrics per imagined step, of the model and of copying the last observed frame.
     pub per_step: Vec<BTreeMap<String, f64>>,
 }
 
 impl Report {
+    /// The numbers of each imagined step, a line a step, with a header.
+    pub fn csv(&self) -> String {
+        let names: Vec<&str> = match self.per_step.first() {
+            Some(first) => first.keys().map(String::as_str).collect(),
+            None => Vec::new(),
+        };
+        let mut lines = vec![format!("step,{}", names.join(","))];
+        for (step, numbers) in self.per_step.iter().enumerate() {
+            let values: Vec<String> = numbers.values().map(f64::to_string).collect();
+            lines.push(format!("{},{}", step + 1, values.join(",")));
+        }
+        lines.join("\n") + "\n"
+    }
+
     fn insert(&mut self, name: &str, Estimate { mean, ci95 }: Estimate) {
         self.numbers.insert(name.to_owned(), mean);
         self.numbers.insert(format!("{name}_ci95"), ci95);
+    }
+}
+
+/// How a model is measured.
+#[derive(Clone, Copy, Debug)]
+pub struct Protocol<'a> {
+    /// Imagined steps.
+    pub horizon: usize,
+    /// Sampled rollouts of which the best counts, metric by metric; none without it.
+    pub samples: u32,
+    /// Networks of the perceptual metrics, if those are wanted.
+    pub perceptual: Option<&'a Perceptual>,
+}
+
+/// Features of videos: the recorded ones, the imagined, and a copy of the last observed frame.
+#[derive(Default)]
+struct Videos([Vec<Tensor>; 3]);
+
+impl Videos {
+    /// Adds the clips from the last observed frame on.
+    fn add(&mut self, perceptual: &Perceptual, recorded: &Recorded, scenes: &[Scene]) {
+        let last = CONDITIONING - 1;
+        let start = &recorded.frames[last];
+        let imagined = scenes[CONDITIONING..].iter().map(image);
+        let clips = [
+            recorded.frames[last..].iter().map(Tensor::shallow_clone).collect::<Vec<_>>(),
+            std::iter::once(start.shallow_clone()).chain(imagined).collect(),
+            recorded.frames[last..].iter().map(|_| start.shallow_clone()).collect(),
+        ];
+        for (features, clip) in self.0.iter_mut().zip(clips) {
+            features.push(perceptual.video_features(&Tensor::stack(&clip, 2)));
+        }
+    }
+
+    /// Fréchet distances to the recorded videos: imagined, copied.
+    fn distances(&self) -> [f64; 2] {
+        let [truth, imagined, copied] = self.0.each_ref().map(|features| Tensor::cat(features, 0));
+        [frechet_distance(&imagined, &truth), frechet_distance(&copied, &truth)]
     }
 }
 
@@ -61,7 +126,8 @@ impl Tally {
     }
 }
 
-/// Measures a model: five frames observed, `horizon` imagined with means, against the recorded future.
+/// Measures a model: five frames observed, the horizon imagined with means (and with samples, of which the best
+/// counts), against the recorded future.
 ///
 /// # Errors
 /// If episodes cannot be read or are shorter than that.
@@ -69,25 +135,43 @@ pub fn report(
     world: &dyn WorldModel,
     dataset: &Dataset,
     range: Range<usize>,
-    horizon: usize,
+    protocol: Protocol<'_>,
     mut progress: impl FnMut(usize),
 ) -> anyhow::Result<Report> {
     let spec = world.spec();
+    let Protocol { horizon, samples, perceptual } = protocol;
     let length = CONDITIONING + horizon;
     let neutral = spec.neutral_action();
     let mut tally = Tally { steps: vec![BTreeMap::new(); horizon], ..Tally::default() };
+    let mut videos = Videos::default();
     let indices: Vec<usize> = range.clone().collect();
     for (chunk, episodes) in indices.chunks(BATCH).enumerate() {
         let recorded = Recorded::read(dataset, episodes, length, &neutral, world.device())?;
-        let scenes = rollout(world, &recorded, &recorded.actions, wanted());
+        let scenes = rollout(world, &recorded, &recorded.actions, Draw::Mean, wanted());
         let swapped = swapped_actions(&recorded);
-        let others = rollout(world, &recorded, &swapped, wanted());
+        let only_frames = Outputs::from_iter([Output::Frame]);
+        let others = rollout(world, &recorded, &swapped, Draw::Mean, only_frames);
+        let first_episode = chunk * BATCH;
+        let mut identities = HashMap::new();
         for t in 0..length {
-            let at = At { t, first_episode: chunk * BATCH };
+            let at = At { t, first_episode };
             add_images(&mut tally, &recorded, &scenes, &others, at);
-            if recorded.labels.is_some() {
-                add_decomposition(&mut tally, &recorded, &scenes[t], spec, at);
+            if let Some(perceptual) = perceptual {
+                add_perceptual(&mut tally, perceptual, &recorded, &scenes, at);
             }
+            if recorded.labels.is_some() {
+                add_decomposition(&mut tally, &recorded, &scenes[t], spec, at, &mut identities);
+            }
+        }
+        let sampled: Vec<Vec<Scene>> = (0..samples)
+            .map(|sample| {
+                let draw = Draw::Sample { seed: SEED + episodes[0] as u64, sample };
+                rollout(world, &recorded, &recorded.actions, draw, only_frames)
+            })
+            .collect();
+        add_best(&mut tally, &recorded, &sampled, first_episode);
+        if let Some(perceptual) = perceptual {
+            videos.add(perceptual, &recorded, &scenes);
         }
         progress(episodes.len());
     }
@@ -100,6 +184,7 @@ pub fn report(
         data: format!("{} episodes {}..{}", dataset.info().name, range.start, range.end),
         episodes: indices.len(),
         horizon,
+        samples,
         ..Report::default()
     };
     for (name, numbers) in &tally.averages {
@@ -107,6 +192,11 @@ pub fn report(
     }
     for (name, numbers) in &tally.ratios {
         report.insert(name, numbers.pooled());
+    }
+    if perceptual.is_some() {
+        let [imagined, copied] = videos.distances();
+        report.numbers.insert("fvd_imagined".to_owned(), imagined);
+        report.numbers.insert("fvd_copy".to_owned(), copied);
     }
     report.per_step = tally
         .steps
@@ -143,10 +233,66 @@ fn swapped_actions(recorded: &Recorded) -> Vec<Tensor> {
     recorded.actions.iter().enumerate().map(swap).collect()
 }
 
+/// The drawn frame, `[B, 3, H, W]` in [0, 1].
+fn image(scene: &Scene) -> Tensor {
+    scene.frame.as_ref().expect("the frame was asked for").clamp(0.0, 1.0)
+}
+
+fn add_perceptual(
+    tally: &mut Tally,
+    perceptual: &Perceptual,
+    recorded: &Recorded,
+    scenes: &[Scene],
+    at: At,
+) {
+    let Some(step) = at.t.checked_sub(CONDITIONING) else { return };
+    let truth = &recorded.frames[at.t];
+    let own = perceptual.st_lpips(&image(&scenes[at.t]), truth);
+    let copies = perceptual.st_lpips(&recorded.frames[CONDITIONING - 1], truth);
+    for (row, (own, copied)) in own.into_iter().zip(copies).enumerate() {
+        let episode = at.first_episode + row;
+        for (name, value) in [("st_lpips", own), ("st_lpips_copy", copied)] {
+            tally.steps[step].entry(name.to_owned()).or_default().add(episode, value);
+        }
+        tally.average("st_lpips_imagined", episode, own);
+        tally.average("st_lpips_copy", episode, copied);
+    }
+}
+
+/// Each metric's best sampled rollout, by its mean over imagined steps.
+fn add_best(tally: &mut Tally, recorded: &Recorded, sampled: &[Vec<Scene>], first_episode: usize) {
+    let mut best: Vec<[f64; 4]> = Vec::new();
+    for scenes in sampled {
+        let imagined = &scenes[CONDITIONING..];
+        let mut means = vec![[0.0; 4]; recorded.frames[0].size()[0] as usize];
+        for (scene, truth) in imagined.iter().zip(&recorded.frames[CONDITIONING..]) {
+            for (mean, metrics) in means.iter_mut().zip(images::all(&image(scene), truth)) {
+                for (mean, metric) in mean.iter_mut().zip(metrics) {
+                    *mean += metric / imagined.len() as f64;
+                }
+            }
+        }
+        if best.is_empty() {
+            best.clone_from(&means);
+        }
+        for (best, mean) in best.iter_mut().zip(&means) {
+            for (metric, name) in images::NAMES.iter().enumerate() {
+                let lower_is_better = *name == "mse";
+                if (mean[metric] < best[metric]) == lower_is_better {
+                    best[metric] = mean[metric];
+                }
+            }
+        }
+    }
+    for (row, metrics) in best.iter().enumerate() {
+        for (name, value) in images::NAMES.iter().zip(metrics) {
+            tally.average(&format!("{name}_best"), first_episode + row, *value);
+        }
+    }
+}
+
 fn add_images(tally: &mut Tally, recorded: &Recorded, scenes: &[Scene], others: &[Scene], at: At) {
     let truth = &recorded.frames[at.t];
-    let image =
-        |scene: &Scene| scene.frame.as_ref().expect("the frame was asked for").clamp(0.0, 1.0);
     let own = images::all(&image(&scenes[at.t]), truth);
     let phase = at.phase();
     for (row, metrics) in own.iter().enumerate() {
@@ -178,6 +324,7 @@ fn add_decomposition(
     scene: &Scene,
     spec: &gatsbi_models::world_model::ModelSpec,
     at: At,
+    identities: &mut HashMap<(usize, i64), i64>,
 ) {
     let labels = &recorded.labels.as_ref().expect("the caller checked")[at.t];
     let segmentation = decomposition::segmentation(scene);
@@ -198,7 +345,7 @@ fn add_decomposition(
         let entities = decomposition::entities(&segmentation, &is_background, row as i64);
         let ari = decomposition::adjusted_rand_index(&entities, &labels.get(row as i64));
         tally.average(&format!("ari_{phase}"), episode, ari);
-        let (counts, _) = decomposition::match_objects(scene, labels, row as i64);
+        let (counts, matches) = decomposition::match_objects(scene, labels, row as i64);
         let matched = counts.matched as f64;
         let suffix = if at.t < CONDITIONING { "" } else { "_imagined" };
         let mut ratio = |name: &str, numerator: f64, denominator: usize| {
@@ -207,5 +354,10 @@ fn add_decomposition(
         ratio("object_recall", matched, counts.truth);
         ratio("object_precision", matched, counts.found);
         ratio("object_position_px", counts.distance, counts.matched);
+        for (label, id) in matches {
+            if let Some(before) = identities.insert((episode, label), id) {
+                ratio("identity_switches", f64::from(u8::from(before != id)), 1);
+            }
+        }
     }
 }

@@ -1,0 +1,283 @@
+"""The blocking client."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any, Callable, Iterable, Iterator, Mapping, Sequence, TypeVar
+
+import grpc
+import numpy.typing as npt
+
+from gatsbi_client import _core as core
+from gatsbi_client import errors
+from gatsbi_client import types as t
+from gatsbi_client._core import Image, Retries
+from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
+from gatsbi_client.costs import CostProgram
+
+T = TypeVar("T")
+
+
+class Client:
+    """A connection to a server, such as `127.0.0.1:50051`. Safe to share between threads."""
+
+    def __init__(self, address: str, *, timeout: float = 30.0, retries: Retries = Retries()) -> None:
+        """`timeout` is in seconds for a whole call with all its tries."""
+        self._channel = grpc.insecure_channel(address, options=core.CHANNEL_OPTIONS)
+        self._timeout = timeout
+        self._retries = retries
+
+    def close(self) -> None:
+        """Closes the connection."""
+        self._channel.close()
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _call(self, call: core.Call[T]) -> T:
+        invoke = self._channel.unary_unary(
+            f"/gatsbi.v1.{call.method}", type(call.request).SerializeToString, call.answer.FromString
+        )
+        end, attempt = time.monotonic() + self._timeout, 0
+        while True:
+            attempt += 1
+            try:
+                return call.parse(invoke(call.request, timeout=max(end - time.monotonic(), 0.001)))
+            except grpc.RpcError as failed:
+                error = core.translate(failed)
+                wait = self._retries.wait(attempt, error, call.repeatable)
+                if wait is None or time.monotonic() + wait >= end:
+                    raise error from failed
+            time.sleep(wait)
+
+    def _gather(self, call: core.Call[t.Chunk]) -> t.Rollout:
+        end, attempt = time.monotonic() + self._timeout, 0
+        while True:
+            attempt += 1
+            try:
+                return core.gather([chunk for chunk in self._chunks(call, end - time.monotonic())])
+            except errors.GatsbiError as error:
+                wait = self._retries.wait(attempt, error, call.repeatable)
+                if wait is None or time.monotonic() + wait >= end:
+                    raise
+            time.sleep(wait)
+
+    def _chunks(self, call: core.Call[t.Chunk], timeout: float) -> Iterator[t.Chunk]:
+        invoke = self._channel.unary_stream(
+            f"/gatsbi.v1.{call.method}", type(call.request).SerializeToString, call.answer.FromString
+        )
+        answers = invoke(call.request, timeout=max(timeout, 0.001))
+        try:
+            for answer in answers:
+                yield call.parse(answer)
+        except grpc.RpcError as failed:
+            raise core.translate(failed) from failed
+        finally:
+            answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
+
+    def models(self) -> tuple[t.Model, ...]:
+        """All models, sorted by name."""
+        return self._call(core.list_models())
+
+    def create_session(
+        self, model: str = "", *, label: str = "", samples: bool = False, seed: int | None = None,
+        keep_steps: int = 0,
+    ) -> Session:
+        """Opens a session. `samples`: observing draws instead of taking means; `keep_steps`: for rewinding."""
+        return Session(self, self._call(core.create(model, label, samples, seed, keep_steps)))
+
+    def session(self, session_id: str) -> Session:
+        """A session that is open already."""
+        return Session(self, self._call(core.get(session_id)))
+
+    def import_session(self, snapshot: bytes, *, label: str = "", keep_steps: int = 0) -> Session:
+        """A new session from the bytes of `Session.export`."""
+        return Session(self, self._call(core.restore(snapshot, "", label, keep_steps)))
+
+    def put_goal(
+        self, image: Image | None = None, *, masks: Mapping[str, t.Array] | None = None, model: str = "",
+        label: str = "",
+    ) -> t.Goal:
+        """Keeps a goal. `masks`: `[H, W]` in [0, 1] or uint8, by `all_objects` or `agent`."""
+        return self._call(core.put_goal(image, masks or {}, model, label))
+
+    def delete_goal(self, goal_id: str) -> None:
+        """Forgets a goal."""
+        self._call(core.delete_goal(goal_id))
+
+    def predict_batch(
+        self, requests: Iterable[t.Prediction], *, outputs: Sequence[t.OutputName],
+        encoding: t.EncodingName = "f32", every_k: int | None = None, last_only: bool = False,
+        costs: CostProgram | None = None, timeout: float | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> Iterator[t.PredictionPart]:
+        """Many rollouts over one stream: parts as they arrive, in any order. Never tried again by itself.
+
+        `progress` is called with the number of predictions that have ended.
+        """
+        call = core.predictions(requests, outputs, encoding, every_k, last_only, costs)
+        invoke = self._channel.stream_stream(
+            f"/gatsbi.v1.{call.method}", PredictBatchRequest.SerializeToString, call.answer.FromString
+        )
+        answers, done = invoke(call.request, timeout=timeout), 0
+        try:
+            for answer in answers:
+                part = call.parse(answer)
+                if part.last:
+                    done += 1
+                    if progress is not None:
+                        progress(done)
+                yield part
+        except grpc.RpcError as failed:
+            raise core.translate(failed) from failed
+        finally:
+            answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
+
+    def open_handles(
+        self, starts: Iterable[str | bytes], *, samples: int | None = None, seed: int | None = None
+    ) -> Handles:
+        """Rows for a policy outside: one for each session id or snapshot, times `samples`."""
+        return Handles(self, self._call(core.open_handles(starts, samples, seed)))
+
+
+class Session:
+    """One robot's belief. As a context manager it deletes the session at the end."""
+
+    def __init__(self, client: Client, info: t.SessionInfo) -> None:
+        self._client = client
+        self._next = info.next_step
+        self.id = info.id
+        self.info = info
+        """As the server last described it."""
+
+    @property
+    def next_step(self) -> int:
+        """Number that the next observation bears."""
+        return self._next
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.delete()
+        except errors.GatsbiError as failed:
+            # An error of the body says more, and a session that is gone already needs no deleting.
+            if error is None and not isinstance(failed, errors.NotFound):
+                raise
+
+    def refresh(self) -> t.SessionInfo:
+        """Asks the server, and takes over its next step."""
+        return self._take(self._client._call(core.get(self.id)))
+
+    def _take(self, info: t.SessionInfo) -> t.SessionInfo:
+        self.info, self._next = info, info.next_step
+        return info
+
+    def observe(
+        self, image: Image | None, action: npt.ArrayLike | None = None, *,
+        outputs: Sequence[t.OutputName] = ("objects",), encoding: t.EncodingName = "f32", step: int | None = None,
+    ) -> t.Belief:
+        """Absorbs an image (None: a dropped frame) and the action that led to it, raw units `[A]`."""
+        number = self._next if step is None else step
+        belief = self._client._call(core.observe(self.id, number, image, action, outputs, encoding))
+        self._next = max(self._next, belief.step + 1)
+        return belief
+
+    def imagine(
+        self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
+        samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        costs: CostProgram | None = None,
+    ) -> t.Rollout:
+        """Rolls actions out, raw units `[N, H, A]` or `[H, A]`. Without `samples`, means are taken."""
+        return self._client._gather(core.imagine(
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+        ))
+
+    def imagine_chunks(
+        self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
+        samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        costs: CostProgram | None = None,
+    ) -> Iterator[t.Chunk]:
+        """As `imagine`, chunk by chunk as they arrive; not tried again by itself."""
+        return self._client._chunks(core.imagine(
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+        ), self._client._timeout)
+
+    def score(
+        self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
+        by_sample: bool = False, by_term: bool = False,
+    ) -> t.Scores:
+        """Costs of candidates `[N, H, A]`, raw units."""
+        return self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
+
+    def plan(
+        self, horizon: int, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
+        optimiser: Any = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
+        warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
+        outputs: Sequence[t.OutputName] = (),
+    ) -> t.Plan:
+        """The best actions found within `budget` seconds. `warm_start`: True for the previous plan, or actions."""
+        return self._client._call(core.plan(
+            self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget, outputs
+        ))
+
+    def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[Session, ...]:
+        """New sessions with this one's belief."""
+        infos = self._client._call(core.fork(self.id, count, label, seed))
+        return tuple(Session(self._client, info) for info in infos)
+
+    def rewind(self, to_step: int) -> t.SessionInfo:
+        """Makes a kept step the last one observed."""
+        return self._take(self._client._call(core.rewind(self.id, to_step)))
+
+    def export(self) -> bytes:
+        """The belief as bytes."""
+        return self._client._call(core.export(self.id))
+
+    def restore(self, snapshot: bytes) -> t.SessionInfo:
+        """Replaces this session's belief by an exported one."""
+        return self._take(self._client._call(core.restore(snapshot, self.id, "", 0)))
+
+    def delete(self) -> None:
+        """Closes the session."""
+        self._client._call(core.delete(self.id))
+
+
+class Handles:
+    """Rows that a policy outside steps. As a context manager it gives them back at the end."""
+
+    def __init__(self, client: Client, info: t.HandlesInfo) -> None:
+        self._client = client
+        self._step = 0
+        self.info = info
+
+    def __enter__(self) -> Handles:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def step(
+        self, actions: npt.ArrayLike, *, rows: Sequence[int] = (), restart: Sequence[int] = (),
+        outputs: Sequence[t.OutputName] = ("objects",), encoding: t.EncodingName = "f32",
+    ) -> t.HandlesStep:
+        """Steps rows (all by default) by actions `[rows, A]`; rows in `restart` go back to their start before."""
+        call = core.step_handles(self.info.id, self._step, actions, rows, restart, outputs, encoding)
+        answer = self._client._call(call)
+        self._step = answer.step
+        return answer
+
+    def close(self) -> None:
+        """Gives the rows back."""
+        self._client._call(core.close_handles(self.info.id))
