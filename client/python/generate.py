@@ -1,4 +1,7 @@
-"""Generates `gatsbi_client/_proto` from the proto files. Run it after changing them: `python generate.py`."""
+"""Generates `gatsbi_client/_proto` from the proto files, and the blocking client from the asyncio one.
+
+Run it after changing either: `python generate.py`.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ SERVICE = HERE.parent.parent / "proto"
 OWN = HERE / "proto"
 
 
-def generate(target: Path) -> None:
+def messages(target: Path) -> None:
     """Writes the generated package into `target`, replacing what was there."""
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)
@@ -34,5 +37,29 @@ def generate(target: Path) -> None:
         (folder / "__init__.py").write_text("")
 
 
+def blocking(asyncio_client: str) -> str:
+    """The source of the blocking client."""
+    text = asyncio_client
+    for awaited, plain in [
+        ("The asyncio client. `generate.py` makes the blocking one of it.", "The blocking client, made by `generate.py`."),
+        ("import asyncio\n", ""),
+        ("asyncio.sleep", "time.sleep"),
+        # Stubs demand the grace period, which the blocking channel does not know.
+        (".close(None)", ".close()"),
+        ("grpc.aio.", "grpc."),
+        ("__aenter__", "__enter__"),
+        ("__aexit__", "__exit__"),
+    ]:
+        text = text.replace(awaited, plain)
+    text = re.sub(r"\basync (?=def|with|for)|\bawait ", "", text)
+    return re.sub(r"\bAsync(?=[A-Z])", "", text)
+
+
+def generate(target: Path) -> None:
+    """Writes into `target` what is generated of the package."""
+    messages(target / "_proto")
+    (target / "_sync.py").write_text(blocking((HERE / "gatsbi_client" / "_aio.py").read_text()))
+
+
 if __name__ == "__main__":
-    generate(HERE / "gatsbi_client" / "_proto")
+    generate(HERE / "gatsbi_client")

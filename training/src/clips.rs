@@ -63,8 +63,9 @@ impl Clips {
                 Tensor::from_slice(&data.actions).view([length, info.actions.len() as i64]);
             read.push((frames, actions));
         }
-        let median = median(&read);
-        let shadow = shadow_threshold(&read, &median);
+        let sample = sample(&read);
+        let median = sample.median_dim(0, false).0;
+        let shadow = shadow_threshold(&sample, &median);
         let episodes: Vec<Episode> = read
             .into_iter()
             .map(|(frames, actions)| {
@@ -176,15 +177,10 @@ fn sample(episodes: &[(Tensor, Tensor)]) -> Tensor {
     Tensor::cat(&sample, 0)
 }
 
-/// Per-pixel median over a sample of frames, `[3, H, W]` u8.
-fn median(episodes: &[(Tensor, Tensor)]) -> Tensor {
-    sample(episodes).median_dim(0, false).0
-}
-
 /// The foot behind the peak that shadows and noise make in the histogram of differences from the median, in [0, 1].
 /// Arm and objects differ by anything and make no peak of their own.
-fn shadow_threshold(episodes: &[(Tensor, Tensor)], median: &Tensor) -> f64 {
-    let levels = differences(&sample(episodes), median).round().to_kind(Kind::Int64);
+fn shadow_threshold(sample: &Tensor, median: &Tensor) -> f64 {
+    let levels = differences(sample, median).round().to_kind(Kind::Int64);
     let counts = levels.flatten(0, -1).bincount::<Tensor>(None, 256).to_kind(Kind::Float);
     let counts: Vec<f32> = Vec::try_from(counts).expect("counts are one-dimensional");
     foot(&counts) as f64 / 255.0

@@ -92,12 +92,12 @@ impl Recipe {
                 "{field} has a value that is not positive"
             );
         }
-        for (step, imagined) in &recipe.imagined.0 {
+        for (step, _) in recipe.imagined.0.iter().chain(&recipe.length.0) {
+            let [imagined, length] = [&recipe.imagined, &recipe.length].map(|of| of.at(*step));
             ensure!(
-                *imagined < recipe.length.at(*step),
-                "{imagined} of {} frames are imagined from step {step} on, expected one observed at \
-                 least",
-                recipe.length.at(*step)
+                imagined < length,
+                "{imagined} of {length} frames are imagined from step {step} on, expected one \
+                 observed at least"
             );
         }
         Ok(recipe)

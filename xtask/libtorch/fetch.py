@@ -1,4 +1,4 @@
-"""Provides the files of a recipe: finds its wheels through pip, downloads and checks them, unpacks what is named.
+"""Provides the files of a recipe: finds its packages (`wheels`, or source archives) through pip, downloads and checks them, unpacks what is named.
 
 Usage: python3 - RECIPE DOWNLOADS TARGET      (RECIPE is the text of a recipe such as cpu.json)
 

@@ -42,11 +42,11 @@ def rebuild_tensor(storage, offset, shape, strides, *_):
 
 
 class TorchUnpickler(pickle.Unpickler):
-    """Reads PyTorch's format from before version 1.6."""
+    """Reads a pickle of PyTorch's format from before version 1.6; the file is several, and `storages` belongs to all."""
 
-    def __init__(self, file):
+    def __init__(self, file, storages):
         super().__init__(file)
-        self.storages = {}
+        self.storages = storages
 
     def find_class(self, module, name):
         known = {
@@ -67,13 +67,13 @@ class TorchUnpickler(pickle.Unpickler):
 
 
 def read_torch(path):
+    storages = {}
     with open(path, "rb") as file:
-        for _ in range(3):  # magic number, protocol, system
-            pickle.load(file)
-        unpickler = TorchUnpickler(file)
-        tensors = unpickler.load()
-        for key in pickle.load(file):
-            storage = unpickler.storages[key]
+        _magic, _protocol, _system, tensors, keys = (
+            TorchUnpickler(file, storages).load() for _ in range(5)
+        )
+        for key in keys:
+            storage = storages[key]
             (count,) = struct.unpack("<Q", file.read(8))
             storage.data = file.read(count * storage.item_bytes)
     return {

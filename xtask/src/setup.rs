@@ -132,7 +132,6 @@ pub(crate) fn fill(
         fs::remove_dir_all(folder)?;
     }
     fs::rename(unfinished, folder)?;
-    eprintln!("{} is ready", folder.display());
     Ok(())
 }
 

@@ -3,7 +3,6 @@
 `Client` and `Session` block, `AsyncClient` and `AsyncSession` are awaited; both say the same on the wire.
 """
 
-from gatsbi_client import costs
 from gatsbi_client._aio import AsyncClient, AsyncHandles, AsyncSession
 from gatsbi_client._core import Retries
 from gatsbi_client._sync import Client, Handles, Session
@@ -11,11 +10,11 @@ from gatsbi_client.errors import (
     Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotFound, NotImplementedByServer,
     Overloaded, ServerFailure, StepGap, Unavailable,
 )
-from gatsbi_client.types import Belief, Chunk, Goal, Model, Plan, Prediction, PredictionPart, Rollout, Scores
+from gatsbi_client.types import Belief, Chunk, Model, Prediction, PredictionPart, Rollout
 
 __all__ = [
     "AsyncClient", "AsyncHandles", "AsyncSession", "Belief", "Chunk", "Client", "Conflict", "DeadlineExceeded",
-    "FieldProblem", "GatsbiError", "Goal", "Handles", "InvalidRequest", "Model", "NotFound",
-    "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "Retries", "Rollout",
-    "Scores", "ServerFailure", "Session", "StepGap", "Unavailable", "costs",
+    "FieldProblem", "GatsbiError", "Handles", "InvalidRequest", "Model", "NotFound", "NotImplementedByServer",
+    "Overloaded", "Prediction", "PredictionPart", "Retries", "Rollout", "ServerFailure", "Session", "StepGap",
+    "Unavailable",
 ]

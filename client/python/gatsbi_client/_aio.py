@@ -1,11 +1,11 @@
-"""The asyncio client: call for call the blocking one, awaited."""
+"""The asyncio client. `generate.py` makes the blocking one of it."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from types import TracebackType
-from typing import Any, Callable, AsyncIterator, Iterable, Mapping, Sequence, TypeVar
+from typing import AsyncIterator, Callable, Iterable, Sequence, TypeVar
 
 import grpc
 import numpy.typing as npt
@@ -15,13 +15,12 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._core import Image, Retries
 from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
-from gatsbi_client.costs import CostProgram
 
 T = TypeVar("T")
 
 
 class AsyncClient:
-    """A connection to a server, such as `127.0.0.1:50051`. For one event loop."""
+    """A connection to a server, such as `127.0.0.1:50051`."""
 
     def __init__(self, address: str, *, timeout: float = 30.0, retries: Retries = Retries()) -> None:
         """`timeout` is in seconds for a whole call with all its tries."""
@@ -50,7 +49,7 @@ class AsyncClient:
             attempt += 1
             try:
                 return call.parse(await invoke(call.request, timeout=max(end - time.monotonic(), 0.001)))
-            except grpc.aio.AioRpcError as failed:
+            except grpc.RpcError as failed:
                 error = core.translate(failed)
                 wait = self._retries.wait(attempt, error, call.repeatable)
                 if wait is None or time.monotonic() + wait >= end:
@@ -77,7 +76,7 @@ class AsyncClient:
         try:
             async for answer in answers:
                 yield call.parse(answer)
-        except grpc.aio.AioRpcError as failed:
+        except grpc.RpcError as failed:
             raise core.translate(failed) from failed
         finally:
             answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
@@ -101,28 +100,17 @@ class AsyncClient:
         """A new session from the bytes of `AsyncSession.export`."""
         return AsyncSession(self, await self._call(core.restore(snapshot, "", label, keep_steps)))
 
-    async def put_goal(
-        self, image: Image | None = None, *, masks: Mapping[str, t.Array] | None = None, model: str = "",
-        label: str = "",
-    ) -> t.Goal:
-        """Keeps a goal. `masks`: `[H, W]` in [0, 1] or uint8, by `all_objects` or `agent`."""
-        return await self._call(core.put_goal(image, masks or {}, model, label))
-
-    async def delete_goal(self, goal_id: str) -> None:
-        """Forgets a goal."""
-        await self._call(core.delete_goal(goal_id))
-
     async def predict_batch(
         self, requests: Iterable[t.Prediction], *, outputs: Sequence[t.OutputName],
         encoding: t.EncodingName = "f32", every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None, timeout: float | None = None,
+        timeout: float | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> AsyncIterator[t.PredictionPart]:
         """Many rollouts over one stream: parts as they arrive, in any order. Never tried again by itself.
 
         `progress` is called with the number of predictions that have ended.
         """
-        call = core.predictions(requests, outputs, encoding, every_k, last_only, costs)
+        call = core.predictions(requests, outputs, encoding, every_k, last_only)
         invoke = self._channel.stream_stream(
             f"/gatsbi.v1.{call.method}", PredictBatchRequest.SerializeToString, call.answer.FromString
         )
@@ -135,7 +123,7 @@ class AsyncClient:
                     if progress is not None:
                         progress(done)
                 yield part
-        except grpc.aio.AioRpcError as failed:
+        except grpc.RpcError as failed:
             raise core.translate(failed) from failed
         finally:
             answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
@@ -196,40 +184,20 @@ class AsyncSession:
     async def imagine(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None,
     ) -> t.Rollout:
         """Rolls actions out, raw units `[N, H, A]` or `[H, A]`. Without `samples`, means are taken."""
         return await self._client._gather(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
         ))
 
     def imagine_chunks(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None,
     ) -> AsyncIterator[t.Chunk]:
         """As `imagine`, chunk by chunk as they arrive; not tried again by itself."""
         return self._client._chunks(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
         ), self._client._timeout)
-
-    async def score(
-        self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        by_sample: bool = False, by_term: bool = False,
-    ) -> t.Scores:
-        """Costs of candidates `[N, H, A]`, raw units."""
-        return await self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
-
-    async def plan(
-        self, horizon: int, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        optimiser: Any = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
-        warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
-        outputs: Sequence[t.OutputName] = (),
-    ) -> t.Plan:
-        """The best actions found within `budget` seconds. `warm_start`: True for the previous plan, or actions."""
-        return await self._client._call(core.plan(
-            self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget, outputs
-        ))
 
     async def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[AsyncSession, ...]:
         """New sessions with this one's belief."""

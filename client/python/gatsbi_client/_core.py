@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import Any, Callable, Generic, Iterable, Iterator, Mapping, Sequence, TypeVar
+from typing import Any, Callable, Generic, Iterable, Iterator, Sequence, TypeVar
 
 import grpc
 import numpy as np
@@ -13,12 +13,9 @@ import numpy.typing as npt
 from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._proto.gatsbi.v1 import (
-    cost_pb2,
-    goal_pb2,
     imagination_service_pb2 as im,
     model_service_pb2 as mo,
     output_pb2,
-    planning_service_pb2 as pl,
     session_service_pb2 as se,
     step_pb2,
     tensor_pb2,
@@ -261,18 +258,17 @@ def restore(snapshot: bytes, session: str, label: str, keep_steps: int) -> Call[
 def imagine(
     session: str, actions: npt.ArrayLike, outputs: Iterable[t.OutputName], encoding: t.EncodingName,
     samples: int | None, seed: int | None, every_k: int | None, last_only: bool,
-    costs: cost_pb2.CostProgram | None,
 ) -> Call[t.Chunk]:
     request = im.ImagineRequest(
         session_id=session, actions=floats(actions), sampling=sampling(samples, seed),
-        outputs=selection(outputs, encoding, every_k, last_only), costs=costs,
+        outputs=selection(outputs, encoding, every_k, last_only),
     )
     return Call("ImaginationService/Imagine", request, im.ImagineResponse, lambda r: _chunk(r.chunk), True)
 
 
 def predictions(
     requests: Iterable[t.Prediction], outputs: Iterable[t.OutputName], encoding: t.EncodingName,
-    every_k: int | None, last_only: bool, costs: cost_pb2.CostProgram | None,
+    every_k: int | None, last_only: bool,
 ) -> Call[t.PredictionPart]:
     chosen = selection(outputs, encoding, every_k, last_only)
 
@@ -280,7 +276,7 @@ def predictions(
         for each in requests:
             yield im.PredictBatchRequest(
                 key=each.key, start=_start(each.start), actions=floats(each.actions),
-                sampling=sampling(each.samples, each.seed), outputs=chosen, costs=costs,
+                sampling=sampling(each.samples, each.seed), outputs=chosen,
             )
 
     def parse(answer: im.PredictBatchResponse) -> t.PredictionPart:
@@ -318,78 +314,6 @@ def step_handles(
 def close_handles(handles: str) -> Call[None]:
     return Call("ImaginationService/CloseHandles", im.CloseHandlesRequest(handles_id=handles),
                 im.CloseHandlesResponse, lambda r: None, False)
-
-
-def score(
-    session: str, actions: npt.ArrayLike, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
-    by_sample: bool, by_term: bool,
-) -> Call[t.Scores]:
-    request = pl.ScoreRequest(
-        session_id=session, actions=floats(actions), sampling=sampling(samples, seed), costs=costs,
-        by_sample=by_sample, by_term=by_term,
-    )
-
-    def parse(r: pl.ScoreResponse) -> t.Scores:
-        def optional(name: str) -> t.Floats | None:
-            return array(getattr(r, name)) if r.HasField(name) else None
-
-        return t.Scores(r.at_step, r.model_hash, r.seed, array(r.costs), optional("violations"),
-                        optional("by_sample"), optional("by_term"), r.best)
-
-    return Call("PlanningService/Score", request, pl.ScoreResponse, parse, True)
-
-
-def plan(
-    session: str, horizon: int, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
-    optimiser: pl.RandomShooting | pl.Cem | pl.Icem | pl.Mppi | None, action_min: Sequence[float],
-    action_max: Sequence[float], warm_start: npt.ArrayLike | bool, budget: float | None,
-    outputs: Sequence[t.OutputName],
-) -> Call[t.Plan]:
-    fields: dict[str, Any] = {}
-    if optimiser is not None:
-        names = {pl.RandomShooting: "random_shooting", pl.Cem: "cem", pl.Icem: "icem", pl.Mppi: "mppi"}
-        fields[names[type(optimiser)]] = optimiser
-    if warm_start is True:
-        fields["warm_start"] = pl.WarmStart(previous=True)
-    elif warm_start is not False:
-        fields["warm_start"] = pl.WarmStart(actions=floats(warm_start))
-    if budget is not None:
-        fields["budget_millis"] = max(1, round(budget * 1e3))
-    if outputs:
-        fields["outputs"] = selection(outputs, "f32")
-    request = pl.PlanRequest(
-        session_id=session, horizon=horizon, costs=costs, sampling=sampling(samples, seed),
-        action_min=action_min, action_max=action_max, **fields,
-    )
-
-    def parse(r: pl.PlanResponse) -> t.Plan:
-        return t.Plan(
-            r.at_step, r.model_hash, r.seed, array(r.actions), r.cost, r.violation, array(r.std),
-            tuple(r.best_costs), r.iterations, r.candidates, r.stop == pl.STOP_REASON_BUDGET,
-            _outputs(r.outputs), tuple(r.depths),
-        )
-
-    # A plan becomes the previous one of the next, so a repeated warm start would begin elsewhere.
-    return Call("PlanningService/Plan", request, pl.PlanResponse, parse, warm_start is not True)
-
-
-def put_goal(image: Image | None, masks: Mapping[str, t.Array], model: str, label: str) -> Call[t.Goal]:
-    goals = []
-    for part, mask in masks.items():
-        tensor = floats(mask) if mask.dtype != np.uint8 else tensor_pb2.Tensor(
-            dtype=tensor_pb2.DATA_TYPE_U8, shape=mask.shape, data=np.ascontiguousarray(mask).tobytes()
-        )
-        goals.append(goal_pb2.MaskGoal(part=f"MASK_PART_{part.upper()}", masks=tensor))
-    request = pl.PutGoalRequest(
-        model=model, label=label, image=None if image is None else picture(image), masks=goals
-    )
-    return Call("PlanningService/PutGoal", request, pl.PutGoalResponse,
-                lambda r: t.Goal(r.goal.id, r.goal.label, r.goal.model, r.goal.has_image), False)
-
-
-def delete_goal(goal: str) -> Call[None]:
-    return Call("PlanningService/DeleteGoal", pl.DeleteGoalRequest(goal_id=goal), pl.DeleteGoalResponse,
-                lambda r: None, False)
 
 
 def translate(error: Any) -> errors.GatsbiError:

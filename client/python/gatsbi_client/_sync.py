@@ -1,10 +1,10 @@
-"""The blocking client."""
+"""The blocking client, made by `generate.py`."""
 
 from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import Any, Callable, Iterable, Iterator, Mapping, Sequence, TypeVar
+from typing import Iterator, Callable, Iterable, Sequence, TypeVar
 
 import grpc
 import numpy.typing as npt
@@ -14,13 +14,12 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._core import Image, Retries
 from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
-from gatsbi_client.costs import CostProgram
 
 T = TypeVar("T")
 
 
 class Client:
-    """A connection to a server, such as `127.0.0.1:50051`. Safe to share between threads."""
+    """A connection to a server, such as `127.0.0.1:50051`."""
 
     def __init__(self, address: str, *, timeout: float = 30.0, retries: Retries = Retries()) -> None:
         """`timeout` is in seconds for a whole call with all its tries."""
@@ -100,28 +99,17 @@ class Client:
         """A new session from the bytes of `Session.export`."""
         return Session(self, self._call(core.restore(snapshot, "", label, keep_steps)))
 
-    def put_goal(
-        self, image: Image | None = None, *, masks: Mapping[str, t.Array] | None = None, model: str = "",
-        label: str = "",
-    ) -> t.Goal:
-        """Keeps a goal. `masks`: `[H, W]` in [0, 1] or uint8, by `all_objects` or `agent`."""
-        return self._call(core.put_goal(image, masks or {}, model, label))
-
-    def delete_goal(self, goal_id: str) -> None:
-        """Forgets a goal."""
-        self._call(core.delete_goal(goal_id))
-
     def predict_batch(
         self, requests: Iterable[t.Prediction], *, outputs: Sequence[t.OutputName],
         encoding: t.EncodingName = "f32", every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None, timeout: float | None = None,
+        timeout: float | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> Iterator[t.PredictionPart]:
         """Many rollouts over one stream: parts as they arrive, in any order. Never tried again by itself.
 
         `progress` is called with the number of predictions that have ended.
         """
-        call = core.predictions(requests, outputs, encoding, every_k, last_only, costs)
+        call = core.predictions(requests, outputs, encoding, every_k, last_only)
         invoke = self._channel.stream_stream(
             f"/gatsbi.v1.{call.method}", PredictBatchRequest.SerializeToString, call.answer.FromString
         )
@@ -195,40 +183,20 @@ class Session:
     def imagine(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None,
     ) -> t.Rollout:
         """Rolls actions out, raw units `[N, H, A]` or `[H, A]`. Without `samples`, means are taken."""
         return self._client._gather(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
         ))
 
     def imagine_chunks(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
-        costs: CostProgram | None = None,
     ) -> Iterator[t.Chunk]:
         """As `imagine`, chunk by chunk as they arrive; not tried again by itself."""
         return self._client._chunks(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, costs
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
         ), self._client._timeout)
-
-    def score(
-        self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        by_sample: bool = False, by_term: bool = False,
-    ) -> t.Scores:
-        """Costs of candidates `[N, H, A]`, raw units."""
-        return self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
-
-    def plan(
-        self, horizon: int, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        optimiser: Any = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
-        warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
-        outputs: Sequence[t.OutputName] = (),
-    ) -> t.Plan:
-        """The best actions found within `budget` seconds. `warm_start`: True for the previous plan, or actions."""
-        return self._client._call(core.plan(
-            self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget, outputs
-        ))
 
     def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[Session, ...]:
         """New sessions with this one's belief."""

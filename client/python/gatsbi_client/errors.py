@@ -53,7 +53,7 @@ class InvalidRequest(GatsbiError):
 
 
 class NotFound(GatsbiError):
-    """No such session, model, goal or handles."""
+    """No such session, model or handles."""
 
 
 class StepGap(GatsbiError):

@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Mapping
 
-import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
-Floats = npt.NDArray[np.float32]
 
 OutputName = Literal[
     "frame", "agent_mask", "slot_masks", "object_masks", "background", "objects", "latents", "surprise",
-    "log_likelihood", "keypoints", "spread", "object_spread", "costs",
+    "log_likelihood", "keypoints", "spread", "object_spread",
 ]
 """One thing that can be asked for; shapes of one step of one row:
 `frame`, `background` `[H, W, 3]`; `agent_mask`, `spread` `[H, W]`; `slot_masks` `[K, H, W]`;
 `object_masks` `[MAX, H, W]`; `latents` `[D]`; `keypoints` `[N, 3]`; `object_spread` `[MAX, 2]`;
-`surprise`, `log_likelihood` (nats) and `costs` are single numbers.
+`surprise` and `log_likelihood` (nats) are single numbers.
 Imagined `objects` come as two arrays: `object_ids` int64 `[MAX]` (-1: never filled) and `objects` float32
 `[MAX, 6]`: presence in [0, 1], x rightwards and y downwards in [-1, 1], width, height (fractions of the image),
 depth (smaller is nearer)."""
@@ -133,56 +131,6 @@ class Rollout:
     seed: int
     depths: tuple[int, ...]
     outputs: Mapping[str, Array]
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Costs of candidates; smaller is better."""
-
-    at_step: int
-    model_hash: str
-    seed: int
-    costs: Floats
-    """`[N]`."""
-    violations: Floats | None
-    """`[N]`, 0 where no constraint is violated; None without constraints."""
-    by_sample: Floats | None
-    """`[N, S]`, if asked for."""
-    by_term: Floats | None
-    """`[N, terms]` before weighting, if asked for."""
-    best: int
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The best actions found, raw units `[H, A]`."""
-
-    at_step: int
-    model_hash: str
-    seed: int
-    actions: Floats
-    cost: float
-    violation: float
-    std: Floats
-    """Standard deviation of the search at its end, raw units `[H, A]`."""
-    best_costs: tuple[float, ...]
-    iterations: int
-    candidates: int
-    out_of_time: bool
-    """The budget ended the search."""
-    outputs: Mapping[str, Array]
-    """`[1, depths, ...]`."""
-    depths: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Goal:
-    """A goal that the server keeps."""
-
-    id: str
-    label: str
-    model: str
-    has_image: bool
 
 
 @dataclass(frozen=True)
