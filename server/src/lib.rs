@@ -13,6 +13,7 @@ pub mod config;
 pub mod engine;
 pub mod error;
 pub mod media;
+pub mod planning;
 pub mod service;
 pub mod sessions;
 pub mod telemetry;

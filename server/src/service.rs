@@ -1,7 +1,7 @@
 //! The use cases. gRPC and REST are thin skins over this, and tests may call it directly.
 //!
 //! Requests and answers are the messages of the wire; whatever is wrong with them comes back as [`Error`]. A file a
-//! use case: [`models`], [`sessions`] and [`snapshots`], then [`observe`] and [`imagine`].
+//! use case: [`models`], [`sessions`] and [`snapshots`], then [`observe`], [`imagine`] and [`planning`].
 
 mod administration;
 mod answer;
@@ -10,7 +10,9 @@ mod handles;
 mod imagine;
 mod models;
 mod observe;
+mod planning;
 pub mod predict;
+mod programs;
 pub mod rollout;
 mod sessions;
 mod snapshots;

@@ -61,6 +61,17 @@ pub fn wire(value: Value, leading: &[u32]) -> Tensor {
     Tensor { dtype: dtype.into(), shape, data: value.data, values: Vec::new() }
 }
 
+/// Numbers as a tensor.
+pub fn of_floats(shape: &[u32], numbers: &[f32]) -> Tensor {
+    let data: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+    Tensor {
+        dtype: DataType::F32.into(),
+        shape: shape.to_vec(),
+        data: data.into(),
+        values: Vec::new(),
+    }
+}
+
 fn bytes_of<'a>(tensor: &'a Tensor, field: &str, width: usize) -> Result<&'a Bytes, Error> {
     let expected = count(tensor, field)?.saturating_mul(width);
     if tensor.data.len() == expected {

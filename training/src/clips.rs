@@ -7,17 +7,23 @@ use tch::{Device, Kind, Tensor};
 
 use crate::evaluation::Recorded;
 
-/// Levels (of 255) between which shadows and noise change a channel: their peak in the histogram of differences is
-/// looked for here.
+/// Levels (of 255) by which shadows darken a channel: their peak in the histogram is looked for here.
 const SHADOWS: std::ops::Range<usize> = 5..64;
+
+/// Shadows only darken, and near where the robot rests they lie longer than not: a median would keep them. The
+/// background is this quantile of a pixel's values instead.
+const BACKGROUND_QUANTILE: f64 = 0.65;
+
+/// What is brighter than the background by more than this is no noise, in [0, 1].
+const NOISE: f64 = 0.06;
 
 /// Episodes as bytes, with what the trainer derives from them once.
 #[derive(Debug)]
 pub struct Clips {
     episodes: Vec<Episode>,
-    /// Per-pixel median over the data set, `[3, H, W]` in [0, 1].
-    pub median: Tensor,
-    /// Differences up to this count as shadow or noise, in [0, 1]; found in the data.
+    /// The image behind all that moves, `[3, H, W]` in [0, 1]: a quantile of each pixel over the data set.
+    pub background: Tensor,
+    /// What is darker than the background by up to this counts as shadow, in [0, 1]; found in the data.
     pub shadow: f64,
     /// Scaling of the actions.
     pub actions: Vec<ActionDimension>,
@@ -41,9 +47,9 @@ pub struct Batch {
     pub frames: Vec<Tensor>,
     /// `[T]` scaled actions of `[B, A]`, each the one that led to its frame.
     pub actions: Vec<Tensor>,
-    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the data set's median.
+    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the background.
     pub foreground: Vec<Tensor>,
-    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the data set's median and from the episode's.
+    /// `[T]` maps of `[B, 1, H, W]` in [0, 1]: what differs from the background and from the episode's median.
     pub motion: Vec<Tensor>,
 }
 
@@ -64,13 +70,13 @@ impl Clips {
             read.push((frames, actions));
         }
         let sample = sample(&read);
-        let median = sample.median_dim(0, false).0;
-        let shadow = shadow_threshold(&sample, &median);
+        let background = background(&sample);
+        let shadow = shadow_threshold(&sample, &background);
         let episodes: Vec<Episode> = read
             .into_iter()
             .map(|(frames, actions)| {
                 let own = frames.median_dim(0, false).0;
-                let foreground = difference_map(&frames, &median, shadow);
+                let foreground = difference_map(&frames, &background, shadow);
                 let motion = foreground.minimum(&difference_map(&frames, &own, shadow));
                 Episode { frames, foreground, motion, actions }
             })
@@ -92,7 +98,7 @@ impl Clips {
         let scale: Vec<f32> = actions.iter().map(|action| action.scale as f32).collect();
         Ok(Self {
             episodes,
-            median: median.to_kind(Kind::Float) / 255.0,
+            background: background / 255.0,
             shadow,
             actions,
             frame_period: info.frame_period_seconds,
@@ -177,10 +183,16 @@ fn sample(episodes: &[(Tensor, Tensor)]) -> Tensor {
     Tensor::cat(&sample, 0)
 }
 
-/// The foot behind the peak that shadows and noise make in the histogram of differences from the median, in [0, 1].
-/// Arm and objects differ by anything and make no peak of their own.
-fn shadow_threshold(sample: &Tensor, median: &Tensor) -> f64 {
-    let levels = differences(sample, median).round().to_kind(Kind::Int64);
+/// `BACKGROUND_QUANTILE` of every pixel of a sample `[N, 3, H, W]`, `[3, H, W]` in [0, 255].
+fn background(sample: &Tensor) -> Tensor {
+    let rank = (sample.size()[0] as f64 * BACKGROUND_QUANTILE) as i64;
+    sample.sort(0, false).0.select(0, rank).to_kind(Kind::Float)
+}
+
+/// The foot behind the peak that shadows make in the histogram of darkening, in [0, 1].
+/// Arm and objects darken by anything and make no peak of their own.
+fn shadow_threshold(sample: &Tensor, background: &Tensor) -> f64 {
+    let levels = differences(sample, background).0.clamp_min(0.0).round().to_kind(Kind::Int64);
     let counts = levels.flatten(0, -1).bincount::<Tensor>(None, 256).to_kind(Kind::Float);
     let counts: Vec<f32> = Vec::try_from(counts).expect("counts are one-dimensional");
     foot(&counts) as f64 / 255.0
@@ -196,16 +208,20 @@ fn foot(counts: &[f32]) -> usize {
         .unwrap_or(counts.len() - 3)
 }
 
-/// Largest difference of a channel, `[T, H, W]` in [0, 255], of frames `[T, 3, H, W]` from an image.
-fn differences(frames: &Tensor, image: &Tensor) -> Tensor {
-    let float = |x: &Tensor| x.to_kind(Kind::Float);
-    (float(frames) - float(image)).abs().amax(1, false)
+/// By how much a channel of frames `[T, 3, H, W]` is darker, and brighter, than an image at most, `[T, H, W]` in
+/// [-255, 255] each.
+fn differences(frames: &Tensor, image: &Tensor) -> (Tensor, Tensor) {
+    let brighter = frames.to_kind(Kind::Float) - image.to_kind(Kind::Float);
+    ((-&brighter).amax(1, false), brighter.amax(1, false))
 }
 
-/// Where frames `[T, 3, H, W]` differ from an image, more than shadows do, holes of a pixel filled, `[T, H, W]` u8.
+/// Where frames `[T, 3, H, W]` are brighter than an image, or darker than shadows make it, holes of a pixel filled,
+/// `[T, H, W]` u8.
 fn difference_map(frames: &Tensor, image: &Tensor, shadow: f64) -> Tensor {
-    let difference = differences(frames, image) / 255.0;
-    let map = ((difference - shadow) * 40.0).sigmoid().unsqueeze(1);
+    let (darker, brighter) = differences(frames, image);
+    let dark = ((darker / 255.0 - shadow) * 40.0).sigmoid();
+    let bright = ((brighter / 255.0 - NOISE) * 100.0).sigmoid();
+    let map = dark.maximum(&bright).unsqueeze(1);
     let spread = |x: &Tensor| x.max_pool2d([3, 3], [1, 1], [1, 1], [1, 1], false);
     let closed = -spread(&-spread(&map));
     (closed.squeeze_dim(1) * 255.0).round().to_kind(Kind::Uint8)
@@ -214,6 +230,34 @@ fn difference_map(frames: &Tensor, image: &Tensor, shadow: f64) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_brighter_is_foreground_and_a_shadow_is_not() {
+        let image = Tensor::full([3, 3, 16], 120, (Kind::Uint8, Device::Cpu));
+        let frame = image.shallow_clone().unsqueeze(0).copy();
+        for (column, level) in [(2, 95), (8, 145), (13, 40)] {
+            let _ = frame.narrow(3, column, 1).fill_(level);
+        }
+        let map = difference_map(&frame, &image, 0.15);
+        let row: Vec<u8> = map.get(0).get(1).try_into().expect("one row");
+        assert!(
+            row[2] < 40 && row[8] > 245 && row[13] > 245 && row[5] < 10 && row[10] < 10,
+            "{row:?}"
+        );
+    }
+
+    #[test]
+    fn a_shadow_that_lies_longer_than_not_is_no_background() {
+        let sample = Tensor::full([100, 3, 2, 2], 150, (Kind::Uint8, Device::Cpu));
+        let _ = sample.narrow(0, 0, 60).fill_(120);
+        assert!(
+            background(&sample)
+                .eq_tensor(&Tensor::full([3, 2, 2], 150.0, (Kind::Float, Device::Cpu)))
+                .all()
+                .int64_value(&[])
+                == 1
+        );
+    }
 
     #[test]
     fn the_shadow_threshold_is_the_foot_behind_the_shadows_peak() {

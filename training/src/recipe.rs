@@ -142,7 +142,7 @@ pub struct KeypointRecipe {
     pub networks: KeypointLearningConfig,
 }
 
-/// The last slot's component is fitted to the data's per-pixel median through its own posterior.
+/// The last slot's component is fitted to the data's background through its own posterior.
 #[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Prefit {
@@ -216,10 +216,10 @@ pub struct FixedAlpha {
 pub struct RegressionRecipe {
     /// The agent's mask onto the keypoint map (the paper's).
     pub keypoints: Ramp,
-    /// The agent's mask onto the motion map: what differs both from the data's and from the episode's median. It
+    /// The agent's mask onto the motion map: what differs from the data's background and from the episode's median. It
     /// leads where keypoints learn too slowly; it contains moving objects too.
     pub motion: Ramp,
-    /// The agent's mask onto the foreground map, what differs from the data's median, without the objects' alpha.
+    /// The agent's mask onto the foreground map, what differs from the data's background, without the objects' alpha.
     /// It knows the agent better than motion does as soon as objects are known.
     pub foreground: Ramp,
     /// The objects' alpha onto the foreground map without the agent's mask. It leads the boxes to objects before

@@ -233,12 +233,12 @@ impl Trainer {
         Ok(())
     }
 
-    /// Fits the last slot's component to the data's median through its own posterior.
+    /// Fits the last slot's component to the data's background through its own posterior.
     fn prefit(&self, clips: &Clips, journal: &Journal) {
         let Some(prefit) = self.recipe.prefit else { return };
         let model = &self.checkpoint.model;
         let last = model.config().mixture.slots - 1;
-        let median = clips.median.to_device(self.device).unsqueeze(0);
+        let background = clips.background.to_device(self.device).unsqueeze(0);
         let rows = self.recipe.batch;
         // The encoders must not learn to ignore the frame, which a constant target would teach them.
         let stores = [&self.checkpoint.store];
@@ -257,12 +257,12 @@ impl Trainer {
             let noise = noise(Moment { step, ..self.moment() }, 0, rows, self.device);
             let state = model.initial_state(rows);
             let (_, seen) = model.observe(state, &batch.frames[0], &batch.actions[0], &noise, how);
-            let error = (seen.mixture.components.select(1, last) - &median).square();
+            let error = (seen.mixture.components.select(1, last) - &background).square();
             let loss = error.sum(Kind::Float) / rows as f64;
             loss.backward();
             adam.step(&stores, |_| prefit.learning_rate, self.recipe.clip * 10.0);
             if step + 1 == PREFIT_STEPS + prefit.steps {
-                let error = loss.double_value(&[]) / median.numel() as f64;
+                let error = loss.double_value(&[]) / background.numel() as f64;
                 journal.say(&format!("background prefit: mean squared error {error:.5}"));
             }
         }

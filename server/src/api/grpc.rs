@@ -179,16 +179,18 @@ impl ImaginationService for Grpc {
 impl PlanningService for Grpc {
     async fn score(
         &self,
-        _: Request<v1::ScoreRequest>,
+        request: Request<v1::ScoreRequest>,
     ) -> Result<Response<v1::ScoreResponse>, Status> {
-        unimplemented("Score", "scoring").await
+        let call = call::of(request.metadata().as_ref());
+        unary("Score", self.0.score(request.into_inner(), call)).await
     }
 
     async fn plan(
         &self,
-        _: Request<v1::PlanRequest>,
+        request: Request<v1::PlanRequest>,
     ) -> Result<Response<v1::PlanResponse>, Status> {
-        unimplemented("Plan", "planning").await
+        let call = call::of(request.metadata().as_ref());
+        unary("Plan", self.0.find_plan(request.into_inner(), call)).await
     }
 
     async fn put_goal(

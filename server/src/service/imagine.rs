@@ -73,7 +73,7 @@ impl Draws {
     }
 
     /// Where the rows of a rollout begin, all of them at one belief.
-    fn starts(self, position: &Position, candidates: u32) -> Vec<RowStart> {
+    pub(super) fn starts(self, position: &Position, candidates: u32) -> Vec<RowStart> {
         let rows = 0..candidates * self.samples;
         rows.map(|row| self.start(position, row, (row % candidates, row / candidates))).collect()
     }
@@ -162,7 +162,7 @@ impl Service {
         Ok(Rollout::new(chunks, common, selection, draws.samples, deadline))
     }
 
-    fn actions(
+    pub(super) fn actions(
         &self,
         actions: Option<v1::Tensor>,
         spec: &ModelSpec,

@@ -156,6 +156,15 @@ pub struct History {
     seen: VecDeque<Seen>,
 }
 
+/// The actions that were planned last.
+#[derive(Clone, Debug)]
+pub struct Planned {
+    /// The last step observed when they were.
+    pub at_step: u64,
+    /// `[H, A]` in raw units.
+    pub actions: Arc<[f32]>,
+}
+
 /// A session.
 #[derive(Debug)]
 pub struct Session {
@@ -177,6 +186,7 @@ struct Current {
     position: Position,
     answer: Option<Answer>,
     history: History,
+    planned: Option<Planned>,
     used: Instant,
 }
 
@@ -188,7 +198,7 @@ impl Session {
         room: OwnedSemaphorePermit,
         now: Instant,
     ) -> Self {
-        let current = Current { position, answer: None, history, used: now };
+        let current = Current { position, answer: None, history, planned: None, used: now };
         Self {
             id,
             terms,
@@ -213,6 +223,16 @@ impl Session {
     /// The answer to the last observation.
     pub fn answer(&self) -> Option<Answer> {
         self.current.lock().answer.clone()
+    }
+
+    /// What was planned last.
+    pub fn planned(&self) -> Option<Planned> {
+        self.current.lock().planned.clone()
+    }
+
+    /// Keeps what was planned, for the next plan to start from.
+    pub fn plan(&self, planned: Planned) {
+        self.current.lock().planned = Some(planned);
     }
 
     /// The earliest step that it can return to, if there is one.
@@ -286,11 +306,12 @@ impl Session {
     /// Memory that it holds, in bytes; what it shares with forks counts for each.
     pub fn bytes(&self) -> usize {
         let current = self.current.lock();
-        let Current { position, answer, history, .. } = &*current;
+        let Current { position, answer, history, planned, .. } = &*current;
         let rows = 1 + history.positions.len();
         let frames = history.seen.iter().map(Seen::bytes).sum::<usize>();
         let answer = answer.as_ref().map_or(0, |answer| answer.belief.encoded_len());
-        rows * position.model.row_bytes + frames + answer
+        let planned = planned.as_ref().map_or(0, |planned| size_of_val(&*planned.actions));
+        rows * position.model.row_bytes + frames + answer + planned
     }
 }
 

@@ -12,6 +12,7 @@ mod load;
 mod mixes;
 mod models;
 mod observe;
+mod planning;
 mod predictions;
 mod rollouts;
 mod sessions;

@@ -14,7 +14,7 @@ use gatsbi_models::{
 use gatsbi_proto::v1::{
     self, image::Content, imagination_service_client::ImaginationServiceClient,
     model_service_client::ModelServiceClient, output_value::Value,
-    session_service_client::SessionServiceClient,
+    planning_service_client::PlanningServiceClient, session_service_client::SessionServiceClient,
 };
 use gatsbi_server::{
     app::{self, App},
@@ -34,6 +34,7 @@ pub(crate) struct TestServer {
     pub(crate) models: ModelServiceClient<Channel>,
     pub(crate) sessions: SessionServiceClient<Channel>,
     pub(crate) imagination: ImaginationServiceClient<Channel>,
+    pub(crate) planning: PlanningServiceClient<Channel>,
     http: reqwest::Client,
 }
 
@@ -174,6 +175,7 @@ impl TestServer {
         Self {
             models: ModelServiceClient::new(channel.clone()),
             sessions: SessionServiceClient::new(channel.clone()).max_encoding_message_size(most),
+            planning: PlanningServiceClient::new(channel.clone()),
             imagination: ImaginationServiceClient::new(channel).max_encoding_message_size(most),
             http: reqwest::Client::new(),
             app,

@@ -1,4 +1,4 @@
-//! Paths of rollouts.
+//! Paths of rollouts and plans.
 
 use std::convert::Infallible;
 
@@ -43,6 +43,36 @@ pub(super) async fn imagine(
     };
     let rollout = counted::rollout("rest", start).await?;
     if accept.0 == JSON { whole(rollout).await } else { Ok(lines(rollout)) }
+}
+
+pub(super) async fn score(
+    State(service): App,
+    Path(id): Path<String>,
+    accept: Accept,
+    Of(call): Of,
+    body: Result<In<v1::ScoreRequest>, Error>,
+) -> Result<Response, Error> {
+    let answer = answer("Score", async {
+        let mut request = body?.0;
+        name_session(&mut request.session_id, id)?;
+        service.score(request, call).await
+    });
+    Ok(accept.answer(&answer.await?))
+}
+
+pub(super) async fn plan(
+    State(service): App,
+    Path(id): Path<String>,
+    accept: Accept,
+    Of(call): Of,
+    body: Result<In<v1::PlanRequest>, Error>,
+) -> Result<Response, Error> {
+    let answer = answer("Plan", async {
+        let mut request = body?.0;
+        name_session(&mut request.session_id, id)?;
+        service.find_plan(request, call).await
+    });
+    Ok(accept.answer(&answer.await?))
 }
 
 /// All chunks in one document.
