@@ -3,18 +3,20 @@
 `Client` and `Session` block, `AsyncClient` and `AsyncSession` are awaited; both say the same on the wire.
 """
 
+from gatsbi_client import costs
 from gatsbi_client._aio import AsyncClient, AsyncHandles, AsyncSession
 from gatsbi_client._core import Retries
+from gatsbi_client._proto.gatsbi.v1.planning_service_pb2 import Cem, Icem, Mppi, RandomShooting
 from gatsbi_client._sync import Client, Handles, Session
 from gatsbi_client.errors import (
     Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotFound, NotImplementedByServer,
     Overloaded, ServerFailure, StepGap, Unavailable,
 )
-from gatsbi_client.types import Belief, Chunk, Model, Prediction, PredictionPart, Rollout
+from gatsbi_client.types import Belief, Chunk, Model, Plan, Prediction, PredictionPart, Rollout, Scores
 
 __all__ = [
-    "AsyncClient", "AsyncHandles", "AsyncSession", "Belief", "Chunk", "Client", "Conflict", "DeadlineExceeded",
-    "FieldProblem", "GatsbiError", "Handles", "InvalidRequest", "Model", "NotFound", "NotImplementedByServer",
-    "Overloaded", "Prediction", "PredictionPart", "Retries", "Rollout", "ServerFailure", "Session", "StepGap",
-    "Unavailable",
+    "AsyncClient", "AsyncHandles", "AsyncSession", "Belief", "Cem", "Chunk", "Client", "Conflict",
+    "DeadlineExceeded", "FieldProblem", "GatsbiError", "Handles", "Icem", "InvalidRequest", "Model", "Mppi",
+    "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "RandomShooting",
+    "Retries", "Rollout", "Scores", "ServerFailure", "Session", "StepGap", "Unavailable", "costs",
 ]

@@ -15,6 +15,7 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._core import Image, Retries
 from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
+from gatsbi_client.costs import CostProgram
 
 T = TypeVar("T")
 
@@ -198,6 +199,29 @@ class AsyncSession:
         return self._client._chunks(core.imagine(
             self.id, actions, outputs, encoding, samples, seed, every_k, last_only
         ), self._client._timeout)
+
+    async def score(
+        self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
+        by_sample: bool = False, by_term: bool = False,
+    ) -> t.Scores:
+        """Costs of candidates `[N, H, A]`, raw units. Without `samples`, means are taken."""
+        return await self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
+
+    async def plan(
+        self, horizon: int, costs: CostProgram, *, optimiser: t.Optimiser | None = None, samples: int | None = None,
+        seed: int | None = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
+        action_repeat: int = 1, warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
+        outputs: Sequence[t.OutputName] = (), encoding: t.EncodingName = "f32",
+    ) -> t.Plan:
+        """The best actions that `optimiser` (iCEM by default) finds within `budget` seconds.
+
+        `warm_start`: True for the session's previous plan, moved on, or actions `[H, A]`. `outputs`: what to predict
+        under the plan. Without `samples`, futures are means; `seed` then drives the optimiser alone.
+        """
+        return await self._client._call(core.plan(
+            self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget,
+            action_repeat, outputs, encoding,
+        ))
 
     async def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[AsyncSession, ...]:
         """New sessions with this one's belief."""

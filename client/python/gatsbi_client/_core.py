@@ -13,9 +13,11 @@ import numpy.typing as npt
 from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._proto.gatsbi.v1 import (
+    cost_pb2,
     imagination_service_pb2 as im,
     model_service_pb2 as mo,
     output_pb2,
+    planning_service_pb2 as pl,
     session_service_pb2 as se,
     step_pb2,
     tensor_pb2,
@@ -314,6 +316,61 @@ def step_handles(
 def close_handles(handles: str) -> Call[None]:
     return Call("ImaginationService/CloseHandles", im.CloseHandlesRequest(handles_id=handles),
                 im.CloseHandlesResponse, lambda r: None, False)
+
+
+def score(
+    session: str, actions: npt.ArrayLike, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
+    by_sample: bool, by_term: bool,
+) -> Call[t.Scores]:
+    request = pl.ScoreRequest(
+        session_id=session, actions=floats(actions), sampling=sampling(samples, seed), costs=costs,
+        by_sample=by_sample, by_term=by_term,
+    )
+
+    def parse(r: pl.ScoreResponse) -> t.Scores:
+        def optional(name: str) -> t.Floats | None:
+            return array(getattr(r, name)) if r.HasField(name) else None
+
+        return t.Scores(r.at_step, r.model_hash, r.seed, array(r.costs), optional("violations"),
+                        optional("by_sample"), optional("by_term"), r.best)
+
+    return Call("PlanningService/Score", request, pl.ScoreResponse, parse, True)
+
+
+def plan(
+    session: str, horizon: int, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
+    optimiser: t.Optimiser | None, action_min: Sequence[float],
+    action_max: Sequence[float], warm_start: npt.ArrayLike | bool, budget: float | None,
+    action_repeat: int, outputs: Sequence[t.OutputName], encoding: t.EncodingName,
+) -> Call[t.Plan]:
+    # A seed without samples drives the optimiser alone.
+    drawn = step_pb2.Sampling(mode=step_pb2.MODE_MEAN, seed=seed) if samples is None else sampling(samples, seed)
+    fields: dict[str, Any] = {}
+    if optimiser is not None:
+        names = {pl.RandomShooting: "random_shooting", pl.Cem: "cem", pl.Icem: "icem", pl.Mppi: "mppi"}
+        fields[names[type(optimiser)]] = optimiser
+    if warm_start is True:
+        fields["warm_start"] = pl.WarmStart(previous=True)
+    elif warm_start is not False:
+        fields["warm_start"] = pl.WarmStart(actions=floats(warm_start))
+    if budget is not None:
+        fields["budget_millis"] = max(1, round(budget * 1e3))
+    if outputs:
+        fields["outputs"] = selection(outputs, encoding)
+    request = pl.PlanRequest(
+        session_id=session, horizon=horizon, costs=costs, sampling=drawn,
+        action_min=action_min, action_max=action_max, action_repeat=action_repeat, **fields,
+    )
+
+    def parse(r: pl.PlanResponse) -> t.Plan:
+        return t.Plan(
+            r.at_step, r.model_hash, r.seed, array(r.actions), r.cost, r.violation, array(r.std),
+            tuple(r.best_costs), r.iterations, r.candidates, r.stop == pl.STOP_REASON_BUDGET,
+            _outputs(r.outputs), tuple(r.depths),
+        )
+
+    # A plan becomes the previous one of the next, so a repeated warm start would begin elsewhere.
+    return Call("PlanningService/Plan", request, pl.PlanResponse, parse, warm_start is not True)
 
 
 def translate(error: Any) -> errors.GatsbiError:

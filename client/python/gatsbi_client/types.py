@@ -5,9 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Mapping
 
+import numpy as np
 import numpy.typing as npt
 
+from gatsbi_client._proto.gatsbi.v1.planning_service_pb2 import Cem, Icem, Mppi, RandomShooting
+
 Array = npt.NDArray[Any]
+Floats = npt.NDArray[np.float32]
+Optimiser = RandomShooting | Cem | Icem | Mppi
 
 OutputName = Literal[
     "frame", "agent_mask", "slot_masks", "object_masks", "background", "objects", "latents", "surprise",
@@ -131,6 +136,46 @@ class Rollout:
     seed: int
     depths: tuple[int, ...]
     outputs: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Costs of candidates; smaller is better."""
+
+    at_step: int
+    model_hash: str
+    seed: int
+    costs: Floats
+    """`[N]`."""
+    violations: Floats | None
+    """`[N]`, 0 where no constraint is violated; None without constraints."""
+    by_sample: Floats | None
+    """`[N, S]`, if asked for."""
+    by_term: Floats | None
+    """`[N, terms]` before weighting, if asked for."""
+    best: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The best actions found, raw units `[H, A]`."""
+
+    at_step: int
+    model_hash: str
+    seed: int
+    actions: Floats
+    cost: float
+    violation: float
+    std: Floats
+    """Standard deviation of the search at its end, raw units `[H, A]`."""
+    best_costs: tuple[float, ...]
+    iterations: int
+    candidates: int
+    out_of_time: bool
+    """The budget ended the search."""
+    outputs: Mapping[str, Array]
+    """`[1, depths, ...]`."""
+    depths: tuple[int, ...]
 
 
 @dataclass(frozen=True)

@@ -64,6 +64,45 @@ def test_sync_and_asyncio_agree(client, address, frames, dimension):
     assert asyncio.run(other()) == want
 
 
+def test_planning(client, frames, dimension):
+    with client.create_session() as s:
+        belief = s.observe(frames[0])
+        who = belief.present()[0].id
+        program = gc.costs.program(
+            gc.costs.to_target(who, 0.3, 0.2, weight=2.0, when="last_step"),
+            gc.costs.between("agent", who, weight=0.5), gc.costs.overlap("agent", who), gc.costs.spread(who),
+            gc.costs.action_smoothness(previous=np.zeros(dimension)),
+            constraints=[gc.costs.at_most(gc.costs.region("agent", -1, -1, 1, 1), 5.0)], risk="worst",
+        )
+        candidates = np.random.default_rng(0).normal(0, 0.3, (6, 3, dimension))
+        scores = s.score(candidates, program, samples=2, seed=4, by_sample=True, by_term=True)
+        assert scores.by_sample is not None and scores.by_term is not None and scores.violations is not None
+        assert np.allclose(scores.costs, scores.by_sample.max(axis=1)) and not scores.violations.any()
+        assert scores.by_term.shape == (6, 5) and scores.best == scores.costs.argmin()
+        # Without samples futures are means, and a target's cost is that of the rollout.
+        target = gc.costs.program(gc.costs.to_target(who, 0.3, 0.2, when="last_step"))
+        rollout = s.imagine(candidates, outputs=["objects"], last_only=True)
+        ids, table = (rollout.outputs[name][0, :, -1] for name in ("object_ids", "objects"))
+        here = table[ids == who]
+        present = here[:, 0] > 0.5
+        distance = np.where(present, np.hypot(here[:, 1] - 0.3, here[:, 2] - 0.2), 2.0)
+        assert np.allclose(s.score(candidates, target).costs, distance, atol=1e-5)
+
+        start = candidates[distance.argmin()]
+        for optimiser in [
+            gc.RandomShooting(candidates=8), gc.Cem(candidates=8, elites=3, iterations=2),
+            gc.Icem(cem=gc.Cem(candidates=8, elites=3, iterations=2)), gc.Mppi(candidates=8),
+        ]:
+            plan = s.plan(3, target, optimiser=optimiser, seed=5, warm_start=start, outputs=["objects"])
+            assert plan.cost <= distance.min() + 1e-5 and plan.violation == 0 and not plan.out_of_time
+            assert plan.actions.shape == (3, dimension) and plan.outputs["objects"].shape[:2] == (1, 3)
+            again = s.plan(3, target, optimiser=optimiser, seed=5, warm_start=start)
+            assert np.array_equal(plan.actions, again.actions)
+        with pytest.raises(gc.InvalidRequest) as e:
+            s.score(candidates, gc.costs.program(gc.costs.to_target(12345, 0, 0)))
+        assert "costs.terms[0]" in e.value.fields[0].field
+
+
 def test_errors(client, frames, dimension):
     with client.create_session() as s:
         s.observe(frames[0])
