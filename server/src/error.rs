@@ -80,6 +80,12 @@ pub enum Error {
         /// The id that was given.
         id: String,
     },
+    /// A goal that does not exist, or no longer.
+    #[error("there is no goal {id}")]
+    UnknownGoal {
+        /// The id that was given.
+        id: String,
+    },
     /// Handles that are not where the request believes them to be, or that were stepped otherwise.
     #[error("the handles were stepped {stepped} times, not {step}")]
     HandlesMoved {
@@ -257,6 +263,9 @@ impl Error {
             }
             Self::UnknownHandles { id } => {
                 vec![FieldProblem::new("handles_id", id, "the id of open handles")]
+            }
+            Self::UnknownGoal { id } => {
+                vec![FieldProblem::new("goal_id", id, "the id of a goal that is kept")]
             }
             Self::BadCheckpoint { path, reason } => {
                 let expected = format!("a checkpoint that can be served: {reason}");

@@ -6,6 +6,7 @@
 mod administration;
 mod answer;
 mod fields;
+mod goals;
 mod handles;
 mod imagine;
 mod models;
@@ -47,6 +48,7 @@ pub struct Service {
     catalogue: Catalogue,
     registry: Registry,
     handles: Opened,
+    goals: goals::Kept,
     limits: v1::Limits,
     kept: Limits,
     ttl: Duration,
@@ -96,6 +98,7 @@ impl Service {
             catalogue: Catalogue::new(models),
             registry: Registry::new(kept),
             handles: Opened::default(),
+            goals: goals::Kept::default(),
             limits,
             kept,
             ttl: Duration::from_secs(config.session_ttl_seconds),
@@ -118,6 +121,7 @@ impl Service {
     /// Closes what has expired; returns how many sessions are left, and their bytes.
     pub fn sweep(&self, now: Instant) -> (usize, usize) {
         self.handles.sweep(now);
+        self.goals.sweep(now);
         self.registry.sweep(now)
     }
 

@@ -12,11 +12,11 @@ from gatsbi_client.errors import (
     Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotFound, NotImplementedByServer,
     Overloaded, ServerFailure, StepGap, Unavailable,
 )
-from gatsbi_client.types import Belief, Chunk, Model, Plan, Prediction, PredictionPart, Rollout, Scores
+from gatsbi_client.types import Belief, Chunk, Goal, Model, Plan, Prediction, PredictionPart, Rollout, Scores
 
 __all__ = [
     "AsyncClient", "AsyncHandles", "AsyncSession", "Belief", "Cem", "Chunk", "Client", "Conflict",
-    "DeadlineExceeded", "FieldProblem", "GatsbiError", "Handles", "Icem", "InvalidRequest", "Model", "Mppi",
+    "DeadlineExceeded", "FieldProblem", "GatsbiError", "Goal", "Handles", "Icem", "InvalidRequest", "Model", "Mppi",
     "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "RandomShooting",
     "Retries", "Rollout", "Scores", "ServerFailure", "Session", "StepGap", "Unavailable", "costs",
 ]

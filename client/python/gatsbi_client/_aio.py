@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from types import TracebackType
-from typing import AsyncIterator, Callable, Iterable, Sequence, TypeVar
+from typing import AsyncIterator, Callable, Iterable, Mapping, Sequence, TypeVar
 
 import grpc
 import numpy.typing as npt
@@ -100,6 +100,17 @@ class AsyncClient:
     async def import_session(self, snapshot: bytes, *, label: str = "", keep_steps: int = 0) -> AsyncSession:
         """A new session from the bytes of `AsyncSession.export`."""
         return AsyncSession(self, await self._call(core.restore(snapshot, "", label, keep_steps)))
+
+    async def put_goal(
+        self, image: Image | None = None, *, masks: Mapping[t.PartName, t.Array] | None = None,
+        object_ids: Sequence[int] = (), model: str = "", label: str = "",
+    ) -> t.Goal:
+        """Keeps a goal: an image, and masks `[H, W]` (`each_object`: `[objects, H, W]`) in [0, 1] or uint8."""
+        return await self._call(core.put_goal(image, masks or {}, object_ids, model, label))
+
+    async def delete_goal(self, goal_id: str) -> None:
+        """Forgets a goal."""
+        await self._call(core.delete_goal(goal_id))
 
     async def predict_batch(
         self, requests: Iterable[t.Prediction], *, outputs: Sequence[t.OutputName],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from typing import Any, Callable, Generic, Iterable, Iterator, Sequence, TypeVar
+from typing import Any, Callable, Generic, Iterable, Iterator, Mapping, Sequence, TypeVar
 
 import grpc
 import numpy as np
@@ -14,6 +14,7 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._proto.gatsbi.v1 import (
     cost_pb2,
+    goal_pb2,
     imagination_service_pb2 as im,
     model_service_pb2 as mo,
     output_pb2,
@@ -371,6 +372,28 @@ def plan(
 
     # A plan becomes the previous one of the next, so a repeated warm start would begin elsewhere.
     return Call("PlanningService/Plan", request, pl.PlanResponse, parse, warm_start is not True)
+
+
+def put_goal(
+    image: Image | None, masks: Mapping[t.PartName, t.Array], object_ids: Sequence[int], model: str, label: str
+) -> Call[t.Goal]:
+    goals = []
+    for part, mask in masks.items():
+        tensor = floats(mask) if mask.dtype != np.uint8 else tensor_pb2.Tensor(
+            dtype=tensor_pb2.DATA_TYPE_U8, shape=mask.shape, data=np.ascontiguousarray(mask).tobytes()
+        )
+        ids = object_ids if part == "each_object" else ()
+        goals.append(goal_pb2.MaskGoal(part=f"MASK_PART_{part.upper()}", masks=tensor, object_ids=ids))
+    request = pl.PutGoalRequest(
+        model=model, label=label, image=None if image is None else picture(image), masks=goals
+    )
+    return Call("PlanningService/PutGoal", request, pl.PutGoalResponse,
+                lambda r: t.Goal(r.goal.id, r.goal.label, r.goal.model, r.goal.has_image), False)
+
+
+def delete_goal(goal: str) -> Call[None]:
+    return Call("PlanningService/DeleteGoal", pl.DeleteGoalRequest(goal_id=goal), pl.DeleteGoalResponse,
+                lambda r: None, False)
 
 
 def translate(error: Any) -> errors.GatsbiError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from types import TracebackType
-from typing import Iterator, Callable, Iterable, Sequence, TypeVar
+from typing import Iterator, Callable, Iterable, Mapping, Sequence, TypeVar
 
 import grpc
 import numpy.typing as npt
@@ -99,6 +99,17 @@ class Client:
     def import_session(self, snapshot: bytes, *, label: str = "", keep_steps: int = 0) -> Session:
         """A new session from the bytes of `Session.export`."""
         return Session(self, self._call(core.restore(snapshot, "", label, keep_steps)))
+
+    def put_goal(
+        self, image: Image | None = None, *, masks: Mapping[t.PartName, t.Array] | None = None,
+        object_ids: Sequence[int] = (), model: str = "", label: str = "",
+    ) -> t.Goal:
+        """Keeps a goal: an image, and masks `[H, W]` (`each_object`: `[objects, H, W]`) in [0, 1] or uint8."""
+        return self._call(core.put_goal(image, masks or {}, object_ids, model, label))
+
+    def delete_goal(self, goal_id: str) -> None:
+        """Forgets a goal."""
+        self._call(core.delete_goal(goal_id))
 
     def predict_batch(
         self, requests: Iterable[t.Prediction], *, outputs: Sequence[t.OutputName],

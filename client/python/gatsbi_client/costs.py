@@ -11,8 +11,8 @@ from gatsbi_client._proto.gatsbi.v1 import cost_pb2 as pb
 from gatsbi_client._proto.gatsbi.v1.cost_pb2 import Constraint, CostProgram, CostTerm
 
 __all__ = [
-    "Constraint", "CostProgram", "CostTerm", "action_magnitude", "action_smoothness", "at_most", "between", "overlap",
-    "program", "region", "spread", "to_target",
+    "Constraint", "CostProgram", "CostTerm", "action_magnitude", "action_smoothness", "at_most", "between", "goal_image",
+    "goal_masks", "overlap", "program", "region", "spread", "to_target",
 ]
 
 Who = int | Literal["agent", "all_objects"]
@@ -26,7 +26,7 @@ def program(
 ) -> CostProgram:
     """The weighted sum of terms, under constraints. `risk`: how samples of a candidate become one number."""
     return CostProgram(
-        terms=terms, constraints=constraints, discount=discount, risk=pb.Risk.Value(f"RISK_{risk.upper()}"),
+        terms=terms, constraints=constraints, discount=discount, risk=f"RISK_{risk.upper()}",
         worst_share=worst_share, missing_distance=missing_distance,
     )
 
@@ -90,6 +90,24 @@ def spread(who: Who, *, weight: float = 1.0, when: When = "every_step") -> CostT
     return CostTerm(name="spread", weight=weight, when=_when(when), spread=pb.SpreadPenalty(subject=_subject(who)))
 
 
+def goal_image(
+    goal_id: str, *, pixels: Literal["all", "agent", "objects", "background"] = "all", weight: float = 1.0,
+    when: When = "every_step",
+) -> CostTerm:
+    """Mean squared difference to the image of a goal."""
+    measure = pb.GoalImage(goal_id=goal_id, pixels=f"PIXELS_{pixels.upper()}")
+    return CostTerm(name="goal_image", weight=weight, when=_when(when), goal_image=measure)
+
+
+def goal_masks(
+    goal_id: str, *, part: Literal["all_objects", "each_object", "agent"] = "all_objects", weight: float = 1.0,
+    when: When = "every_step",
+) -> CostTerm:
+    """1 - intersection over union of masks with those of a goal."""
+    measure = pb.GoalMasks(goal_id=goal_id, part=f"MASK_PART_{part.upper()}")
+    return CostTerm(name="goal_masks", weight=weight, when=_when(when), goal_masks=measure)
+
+
 def _subject(who: Who) -> pb.Subject:
     if who == "agent":
         return pb.Subject(agent=True)
@@ -98,8 +116,8 @@ def _subject(who: Who) -> pb.Subject:
     return pb.Subject(object_id=int(who))
 
 
-def _when(when: When) -> pb.When:
-    return pb.When.Value(f"WHEN_{when.upper()}")
+def _when(when: When) -> str:
+    return f"WHEN_{when.upper()}"
 
 
 def _distance(squared: bool) -> pb.Distance:

@@ -178,6 +178,20 @@ class Plan:
     depths: tuple[int, ...]
 
 
+PartName = Literal["all_objects", "each_object", "agent"]
+"""A part of a scene that has a mask."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A goal that the server keeps."""
+
+    id: str
+    label: str
+    model: str
+    has_image: bool
+
+
 @dataclass(frozen=True)
 class HandlesInfo:
     """Rows that are stepped from outside."""

@@ -98,6 +98,17 @@ def test_planning(client, frames, dimension):
             assert plan.actions.shape == (3, dimension) and plan.outputs["objects"].shape[:2] == (1, 3)
             again = s.plan(3, target, optimiser=optimiser, seed=5, warm_start=start)
             assert np.array_equal(plan.actions, again.actions)
+        ahead = s.imagine(candidates[2], outputs=["frame", "object_masks"], encoding="u8", last_only=True).outputs
+        masks = {"all_objects": ahead["object_masks"][0, 0, 0].astype(np.float32).sum(0).clip(0, 255) / 255}
+        goal = client.put_goal(ahead["frame"][0, 0, 0], masks=masks)
+        near = gc.costs.program(
+            gc.costs.goal_image(goal.id, when="last_step"), gc.costs.goal_masks(goal.id, when="last_step")
+        )
+        scores = s.score(candidates, near, by_term=True)
+        assert scores.best == 2 and scores.costs[2] < 1e-3 < scores.costs[0]
+        client.delete_goal(goal.id)
+        with pytest.raises(gc.NotFound):
+            s.score(candidates, near)
         with pytest.raises(gc.InvalidRequest) as e:
             s.score(candidates, gc.costs.program(gc.costs.to_target(12345, 0, 0)))
         assert "costs.terms[0]" in e.value.fields[0].field

@@ -195,16 +195,16 @@ impl PlanningService for Grpc {
 
     async fn put_goal(
         &self,
-        _: Request<v1::PutGoalRequest>,
+        request: Request<v1::PutGoalRequest>,
     ) -> Result<Response<v1::PutGoalResponse>, Status> {
-        unimplemented("PutGoal", "goals").await
+        unary("PutGoal", self.0.put_goal(request.into_inner())).await
     }
 
     async fn delete_goal(
         &self,
-        _: Request<v1::DeleteGoalRequest>,
+        request: Request<v1::DeleteGoalRequest>,
     ) -> Result<Response<v1::DeleteGoalResponse>, Status> {
-        unimplemented("DeleteGoal", "goals").await
+        unary("DeleteGoal", async { self.0.delete_goal(request.get_ref()) }).await
     }
 }
 
@@ -214,11 +214,4 @@ async fn unary<T>(
 ) -> Result<Response<T>, Status> {
     let answer = counted::answer("grpc", method, answer).await;
     answer.map(Response::new).map_err(|error| problem::status(&error))
-}
-
-pub(super) async fn unimplemented<T>(
-    method: &'static str,
-    what: &'static str,
-) -> Result<Response<T>, Status> {
-    unary(method, async { Err(Error::Unimplemented { what }) }).await
 }

@@ -51,6 +51,7 @@ pub fn entry(error: &Error) -> Entry {
         Error::UnknownSession { .. } => ("UNKNOWN_SESSION", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownModel { .. } => ("UNKNOWN_MODEL", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownHandles { .. } => ("UNKNOWN_HANDLES", Code::NotFound, StatusCode::NOT_FOUND),
+        Error::UnknownGoal { .. } => ("UNKNOWN_GOAL", Code::NotFound, StatusCode::NOT_FOUND),
         Error::HandlesMoved { .. } => {
             ("HANDLES_MOVED", Code::FailedPrecondition, StatusCode::CONFLICT)
         }
@@ -227,6 +228,7 @@ mod tests {
             Error::UnknownSession { id: "7".into() },
             Error::UnknownModel { name: "x".into(), served: vec!["tiny".into()] },
             Error::UnknownHandles { id: "7".into() },
+            Error::UnknownGoal { id: "7".into() },
             Error::HandlesMoved { step: 3, stepped: 5 },
             Error::BadCheckpoint { path: "x".into(), reason: "it is no checkpoint".into() },
             Error::ModelExists { name: "tiny".into() },

@@ -40,8 +40,8 @@ pub fn router(service: Arc<Service>) -> Router {
         .route("/v1/sessions/{id}/scores", post(rollouts::score))
         .route("/v1/sessions/{id}/plans", post(rollouts::plan))
         .route("/v1/predictions", post(rollouts::predict))
-        .route("/v1/goals", put(|| later("PutGoal", "goals")))
-        .route("/v1/goals/{id}", delete(|| later("DeleteGoal", "goals")))
+        .route("/v1/goals", put(rollouts::put_goal))
+        .route("/v1/goals/{id}", delete(rollouts::delete_goal))
         // The document itself at /openapi.json, and a page over it that needs nothing from elsewhere.
         .merge(SwaggerUi::new("/docs").external_url_unchecked("/openapi.json", DOCUMENT.clone()))
         .fallback(unknown_path)
@@ -56,12 +56,6 @@ pub(super) async fn unknown_path(uri: Uri) -> Error {
 
 pub(super) async fn unknown_method(method: Method, uri: Uri) -> Error {
     Error::UnknownMethod { path: uri.path().to_owned(), method: method.to_string() }
-}
-
-/// A part of the API that is designed and not there yet.
-pub(super) async fn later(method: &'static str, what: &'static str) -> Error {
-    let answer = self::answer::<()>(method, async { Err(Error::Unimplemented { what }) }).await;
-    answer.err().unwrap_or(Error::Unimplemented { what })
 }
 
 /// The session of the path is that of the message.

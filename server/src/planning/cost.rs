@@ -2,6 +2,8 @@
 //!
 //! Positions and distances are in units of the image's half side, x rightwards and y downwards in [-1, 1].
 
+use std::sync::Arc;
+
 use gatsbi_models::scene::{Output, Outputs};
 
 /// Columns of the object table: presence, x, y, width, height, depth.
@@ -105,19 +107,71 @@ pub enum Measure {
         /// Who.
         subject: Subject,
     },
+    /// Mean squared difference from an image; 1 where no pixel counts.
+    GoalImage {
+        /// `[H, W, 3]` in [0, 1].
+        goal: Arc<[f32]>,
+        /// Which pixels count.
+        pixels: Pixels,
+    },
+    /// 1 - intersection over union with masks; their mean.
+    GoalMasks {
+        /// Whose mask should be which, `[H, W]` in [0, 1].
+        goals: Vec<(Subject, Arc<[f32]>)>,
+    },
+}
+
+/// Which pixels of a goal image count.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Pixels {
+    /// All.
+    All,
+    /// Weighted by the predicted agent's mask.
+    Agent,
+    /// Weighted by the predicted objects' masks.
+    Objects,
+    /// Weighted by what is neither.
+    Background,
 }
 
 impl Measure {
     /// Who is looked at.
-    pub fn subjects(&self) -> impl Iterator<Item = Subject> {
-        let both = match self {
+    pub fn subjects(&self) -> Vec<Subject> {
+        match self {
             Self::ToTarget { subject, .. }
             | Self::Region { subject, .. }
-            | Self::Spread { subject } => [Some(*subject), None],
-            Self::Between { a, b, .. } | Self::Overlap { a, b } => [Some(*a), Some(*b)],
-            Self::ActionMagnitude { .. } | Self::ActionSmoothness { .. } => [None, None],
+            | Self::Spread { subject } => vec![*subject],
+            Self::Between { a, b, .. } | Self::Overlap { a, b } => vec![*a, *b],
+            Self::GoalMasks { goals } => goals.iter().map(|(subject, _)| *subject).collect(),
+            Self::ActionMagnitude { .. }
+            | Self::ActionSmoothness { .. }
+            | Self::GoalImage { .. } => vec![],
+        }
+    }
+
+    /// Outputs of a step that it looks at.
+    fn outputs(&self) -> Outputs {
+        let positions = || {
+            self.subjects().into_iter().map(|subject| match subject {
+                Subject::Agent => Output::AgentMask,
+                Subject::Object(_) | Subject::AllObjects => Output::Objects,
+            })
         };
-        both.into_iter().flatten()
+        match self {
+            Self::GoalImage { pixels, .. } => {
+                let masks: &[Output] = match pixels {
+                    Pixels::All => &[],
+                    Pixels::Agent => &[Output::AgentMask],
+                    Pixels::Objects => &[Output::ObjectMasks],
+                    Pixels::Background => &[Output::AgentMask, Output::ObjectMasks],
+                };
+                masks.iter().copied().chain([Output::Frame]).collect()
+            }
+            Self::GoalMasks { .. } if positions().any(|output| output == Output::Objects) => {
+                positions().chain([Output::ObjectMasks]).collect()
+            }
+            _ => positions().collect(),
+        }
     }
 }
 
@@ -188,13 +242,7 @@ impl Program {
 
     /// Outputs of a step that it looks at.
     pub fn outputs(&self) -> Outputs {
-        self.all()
-            .flat_map(|term| term.measure.subjects())
-            .map(|subject| match subject {
-                Subject::Agent => Output::AgentMask,
-                Subject::Object(_) | Subject::AllObjects => Output::Objects,
-            })
-            .collect()
+        self.all().map(|term| term.measure.outputs()).fold(Outputs::default(), Outputs::union)
     }
 }
 
@@ -207,6 +255,32 @@ pub struct Step<'a> {
     pub table: &'a [f32],
     /// The agent, if it was looked for and is seen.
     pub agent: Option<Seen>,
+    /// What was looked for of its pictures.
+    pub pictures: Pictures<'a>,
+}
+
+/// Pictures of an imagined step, values in [0, 1] times 255; empty where nothing looks at them.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Pictures<'a> {
+    /// `[H, W, 3]`.
+    pub frame: &'a [u8],
+    /// `[H, W]`.
+    pub agent: &'a [u8],
+    /// `[slots, H, W]`.
+    pub objects: &'a [u8],
+}
+
+impl Pictures<'_> {
+    /// What all objects cover together.
+    fn covered(&self, pixels: usize) -> Vec<f32> {
+        let mut covered = vec![0.0; pixels];
+        for mask in self.objects.chunks_exact(pixels) {
+            for (sum, share) in covered.iter_mut().zip(mask) {
+                *sum += f32::from(*share) / 255.0;
+            }
+        }
+        covered
+    }
 }
 
 /// Where something is.
@@ -274,6 +348,41 @@ impl Step<'_> {
             Subject::AllObjects => (0..self.ids.len()).filter_map(object).collect(),
         }
     }
+}
+
+/// Mean squared difference of a frame from a goal, over pixels that are weighted.
+fn from_goal(goal: &[f32], pixels: Pixels, pictures: Pictures<'_>) -> f32 {
+    let count = goal.len() / 3;
+    let agent = || pictures.agent.iter().map(|x| f32::from(*x) / 255.0).collect::<Vec<_>>();
+    let weights = match pixels {
+        Pixels::All => vec![1.0; count],
+        Pixels::Agent => agent(),
+        Pixels::Objects => pictures.covered(count),
+        Pixels::Background => {
+            let covered = pictures.covered(count);
+            let share = |(agent, objects): (f32, f32)| (1.0 - agent - objects).max(0.0);
+            agent().into_iter().zip(covered).map(share).collect()
+        }
+    };
+    let (goal, _) = goal.as_chunks::<3>();
+    let (frame, _) = pictures.frame.as_chunks::<3>();
+    let (mut sum, mut total) = (0.0f64, 0.0f64);
+    for ((wanted, found), weight) in goal.iter().zip(frame).zip(weights) {
+        let square = |(x, y): (&f32, &u8)| (x - f32::from(*y) / 255.0).powi(2);
+        let difference: f32 = wanted.iter().zip(found).map(square).sum();
+        sum += f64::from(weight * difference / 3.0);
+        total += f64::from(weight);
+    }
+    // Less than a pixel is nothing.
+    if total < 1.0 { 1.0 } else { (sum / total) as f32 }
+}
+
+/// 1 - intersection over union of masks in [0, 1].
+fn apart(goal: &[f32], mask: impl Iterator<Item = f32>) -> f32 {
+    let (both, either) = goal.iter().zip(mask).fold((0.0f64, 0.0f64), |(both, either), (x, y)| {
+        (both + f64::from(x.min(y)), either + f64::from(x.max(y)))
+    });
+    if either > 0.0 { (1.0 - both / either) as f32 } else { 0.0 }
 }
 
 fn mean(values: impl IntoIterator<Item = f32>) -> Option<f32> {
@@ -354,6 +463,22 @@ fn at_step(measure: &Measure, step: Step<'_>, missing: f32) -> f32 {
                 others.map(|(_, seen)| seen.bounds).filter(|rect| rect.area() > 0.0).collect()
             };
             overlap(&without(&left, *b), &without(&right, *a))
+        }
+        Measure::GoalImage { goal, pixels } => from_goal(goal, *pixels, step.pictures),
+        Measure::GoalMasks { goals } => {
+            let distances = goals.iter().map(|(subject, goal)| {
+                let part = |mask: &[u8]| apart(goal, mask.iter().map(|x| f32::from(*x) / 255.0));
+                match subject {
+                    Subject::Agent => part(step.pictures.agent),
+                    Subject::AllObjects => {
+                        apart(goal, step.pictures.covered(goal.len()).into_iter())
+                    }
+                    Subject::Object(id) => step.slot(*id).map_or(1.0, |slot| {
+                        part(&step.pictures.objects[slot * goal.len()..][..goal.len()])
+                    }),
+                }
+            });
+            mean(distances).unwrap_or(0.0)
         }
         Measure::ActionMagnitude { .. }
         | Measure::ActionSmoothness { .. }
@@ -584,7 +709,11 @@ mod tests {
 
     fn measured(measure: &Measure, second: f32) -> f32 {
         let agent = Some(Seen { centre: [-1.0, 0.0], bounds: Rect([-1.2, -0.2, -0.8, 0.2]) });
-        at_step(measure, Step { ids: &IDS, table: &table(second), agent }, 2.0)
+        at_step(
+            measure,
+            Step { ids: &IDS, table: &table(second), agent, pictures: Pictures::default() },
+            2.0,
+        )
     }
 
     #[track_caller]
@@ -665,7 +794,8 @@ mod tests {
         for (row, steps) in x.iter().enumerate() {
             for (depth, x) in steps.iter().enumerate() {
                 let table = [1.0, *x, 0.0, 0.1, 0.1, 0.0];
-                let step = Step { ids: &[4], table: &table, agent: None };
+                let step =
+                    Step { ids: &[4], table: &table, agent: None, pictures: Pictures::default() };
                 measured.add((row / samples, row % samples, depth), step);
             }
         }
@@ -737,6 +867,31 @@ mod tests {
         let scores = scores(&program, &[&[0.9, 0.1], &[0.5, 0.4]], 2, &[0.0; 4]);
         near(scores.violations[0], 0.4);
         near(scores.violations[1], 0.0);
+    }
+
+    #[test]
+    fn goals_are_compared_where_they_count() {
+        let pictures = Pictures {
+            frame: &[0, 0, 0, 255, 255, 255],
+            agent: &[255, 0],
+            objects: &[0, 255, 0, 0, 0, 0],
+        };
+        let of = |measure: &Measure| {
+            at_step(measure, Step { ids: &IDS, table: &table(1.0), agent: None, pictures }, 2.0)
+        };
+        let image = |pixels| Measure::GoalImage { goal: [0.5; 6].into(), pixels };
+        near(of(&image(Pixels::All)), 0.25);
+        let black = |pixels| Measure::GoalImage { goal: [0.0; 6].into(), pixels };
+        near(of(&black(Pixels::Agent)), 0.0);
+        near(of(&black(Pixels::Objects)), 1.0);
+        near(of(&black(Pixels::Background)), 1.0);
+        let masks =
+            |subject, goal: [f32; 2]| Measure::GoalMasks { goals: vec![(subject, goal.into())] };
+        near(of(&masks(Subject::Agent, [1.0, 0.0])), 0.0);
+        near(of(&masks(Subject::Agent, [1.0, 1.0])), 0.5);
+        near(of(&masks(Subject::Object(4), [0.0, 1.0])), 0.0);
+        near(of(&masks(Subject::Object(9), [0.0, 1.0])), 1.0);
+        near(of(&masks(Subject::AllObjects, [0.0, 0.5])), 0.5);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use crate::{
     engine::commands::{Chunk, Depths, Form, Imagine, NumberType, Spent, Tenant, Urgency, Wanted},
     error::Error,
     planning::{
-        cost::{Measured, Program, Scores, Seen, Size, Step},
+        cost::{Measured, Pictures, Program, Scores, Seen, Size, Step},
         search::{Rank, Search, Space},
     },
     sessions::session::{Planned, Position, Session},
@@ -47,7 +47,7 @@ impl Service {
         let session = self.session(&request.session_id)?;
         let position = session.position();
         let spec = &position.model.spec;
-        let program = programs::program(request.costs, spec)?;
+        let program = programs::program(request.costs, spec, &|id| self.goal(id))?;
         let (actions, candidates, horizon) = self.actions(request.actions, spec)?;
         let draws = self.draws(request.sampling.unwrap_or_default())?;
         let at_step = position.last(request.at_step)?;
@@ -97,7 +97,7 @@ impl Service {
         let position = session.position();
         let spec = &position.model.spec;
         let space = self.space(&request, spec)?;
-        let program = programs::program(request.costs, spec)?;
+        let program = programs::program(request.costs, spec, &|id| self.goal(id))?;
         let optimiser = programs::optimiser(request.optimiser, self.limits.max_candidates)?;
         let sampling = request.sampling.unwrap_or_default();
         let seed = sampling.seed.unwrap_or_else(fields::random_seed);
@@ -330,7 +330,10 @@ fn add(measured: &mut Measured<'_>, program: &Program, chunk: &Chunk) -> Result<
     let table: Vec<f32> = value(Output::Objects, NumberType::F32).map_or_else(Vec::new, |value| {
         value.data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
     });
-    let masks = value(Output::AgentMask, NumberType::U8);
+    let picture = |output: Output| value(output, NumberType::U8);
+    let bytes = |output: Output| picture(output).map_or(&[][..], |value| &value.data[..]);
+    let (frames, masks) = (bytes(Output::Frame), bytes(Output::ObjectMasks));
+    let agents = bytes(Output::AgentMask);
     for row in 0..candidates {
         let of = |all: usize| row * all / candidates..(row + 1) * all / candidates;
         let ids = &ids[of(ids.len())];
@@ -338,14 +341,18 @@ fn add(measured: &mut Measured<'_>, program: &Program, chunk: &Chunk) -> Result<
             // Nothing is discovered on the way, so the first step has the objects of the belief.
             programs::objects_are_known(program, ids)?;
         }
-        let agent = masks.and_then(|value| {
-            let mask: Vec<f32> =
-                value.data[of(value.data.len())].iter().map(|x| f32::from(*x) / 255.0).collect();
+        let pictures = Pictures {
+            frame: &frames[of(frames.len())],
+            agent: &agents[of(agents.len())],
+            objects: &masks[of(masks.len())],
+        };
+        let agent = picture(Output::AgentMask).and_then(|value| {
+            let mask: Vec<f32> = pictures.agent.iter().map(|x| f32::from(*x) / 255.0).collect();
             Seen::of_mask(&mask, *value.shape.last()?)
         });
         let at =
             (chunk.first_candidate as usize + row, chunk.sample as usize, chunk.depth as usize - 1);
-        measured.add(at, Step { ids, table: &table[of(table.len())], agent });
+        measured.add(at, Step { ids, table: &table[of(table.len())], agent, pictures });
     }
     Ok(())
 }

@@ -1,14 +1,17 @@
 //! Cost programs and optimisers of the wire, checked field by field.
 
+use std::sync::Arc;
+
 use gatsbi_models::world_model::ModelSpec;
 use gatsbi_proto::v1::{
     self, cost_term::Measure as Wire, plan_request::Optimiser as WireOptimiser, subject::Who,
 };
 
+use super::goals::Goal;
 use crate::{
     error::Error,
     planning::{
-        cost::{Measure, Program, Rect, Risk, Subject, Term, When},
+        cost::{Measure, Pixels, Program, Rect, Risk, Subject, Term, When},
         search::{Icem, Optimiser},
     },
 };
@@ -19,11 +22,18 @@ const MAX_TERMS: usize = 64;
 /// Iterations of a search.
 const MAX_ITERATIONS: u32 = 100;
 
+/// Finds the goal with an id.
+type FindGoal<'a> = &'a dyn Fn(&str) -> Result<Arc<Goal>, Error>;
+
 /// A cost program.
 ///
 /// # Errors
-/// If a field is wrong.
-pub(super) fn program(asked: Option<v1::CostProgram>, spec: &ModelSpec) -> Result<Program, Error> {
+/// If a field is wrong, or a goal is not kept.
+pub(super) fn program(
+    asked: Option<v1::CostProgram>,
+    spec: &ModelSpec,
+    goals: FindGoal<'_>,
+) -> Result<Program, Error> {
     let asked = asked.ok_or_else(|| Error::invalid("costs", "absent", "a cost program"))?;
     let count = |field: &str, found: usize, least: usize| {
         if (least..=MAX_TERMS).contains(&found) {
@@ -48,14 +58,14 @@ pub(super) fn program(asked: Option<v1::CostProgram>, spec: &ModelSpec) -> Resul
     for (at, term) in asked.terms.into_iter().enumerate() {
         let field = format!("costs.terms[{at}]");
         let weight = finite(term.weight.unwrap_or(1.0), &format!("{field}.weight"))?;
-        terms.push((self::term(term, &field, spec)?, weight));
+        terms.push((self::term(term, &field, spec, goals)?, weight));
     }
     let mut constraints = Vec::new();
     for (at, constraint) in asked.constraints.into_iter().enumerate() {
         let field = format!("costs.constraints[{at}]");
         let most = finite(constraint.at_most, &format!("{field}.at_most"))?;
         let term = constraint.term.unwrap_or_default();
-        constraints.push((self::term(term, &format!("{field}.term"), spec)?, most));
+        constraints.push((self::term(term, &format!("{field}.term"), spec, goals)?, most));
     }
     Ok(Program {
         terms,
@@ -71,7 +81,12 @@ pub(super) fn program(asked: Option<v1::CostProgram>, spec: &ModelSpec) -> Resul
     })
 }
 
-fn term(term: v1::CostTerm, field: &str, spec: &ModelSpec) -> Result<Term, Error> {
+fn term(
+    term: v1::CostTerm,
+    field: &str,
+    spec: &ModelSpec,
+    goals: FindGoal<'_>,
+) -> Result<Term, Error> {
     let when = match v1::When::try_from(term.when) {
         Ok(v1::When::Unspecified | v1::When::EveryStep) => When::EveryStep,
         Ok(v1::When::LastStep) => When::LastStep,
@@ -140,11 +155,63 @@ fn term(term: v1::CostTerm, field: &str, spec: &ModelSpec) -> Result<Term, Error
         Some(Wire::Spread(asked)) => Measure::Spread {
             subject: subject(asked.subject, &format!("{field}.spread.subject"), spec)?,
         },
-        Some(Wire::GoalImage(_) | Wire::GoalMasks(_)) => {
-            return Err(Error::Unimplemented { what: "goals" });
+        Some(Wire::GoalImage(asked)) => {
+            let field = format!("{field}.goal_image");
+            let pixels = match v1::Pixels::try_from(asked.pixels) {
+                Ok(v1::Pixels::Unspecified | v1::Pixels::All) => Pixels::All,
+                Ok(v1::Pixels::Agent) => Pixels::Agent,
+                Ok(v1::Pixels::Objects) => Pixels::Objects,
+                Ok(v1::Pixels::Background) => Pixels::Background,
+                Err(_) => {
+                    let field = format!("{field}.pixels");
+                    return Err(Error::invalid(field, asked.pixels, "known pixels"));
+                }
+            };
+            if spec.agent_slot.is_none() && matches!(pixels, Pixels::Agent | Pixels::Background) {
+                let expected = "all or objects: the model has no agent";
+                return Err(Error::invalid(format!("{field}.pixels"), asked.pixels, expected));
+            }
+            let goal = goal(&asked.goal_id, &field, spec, goals)?;
+            let image = goal.image.clone().ok_or_else(|| {
+                Error::invalid(format!("{field}.goal_id"), &goal.id, "a goal with an image")
+            })?;
+            Measure::GoalImage { goal: image, pixels }
+        }
+        Some(Wire::GoalMasks(asked)) => {
+            let field = format!("{field}.goal_masks");
+            let part = part(asked.part, &format!("{field}.part"))?;
+            let goal = goal(&asked.goal_id, &field, spec, goals)?;
+            let goals = goal.masks.get(&part).cloned().ok_or_else(|| {
+                let expected = format!("a goal with masks of {}", part.as_str_name());
+                Error::invalid(format!("{field}.goal_id"), &goal.id, expected)
+            })?;
+            Measure::GoalMasks { goals }
         }
     };
     Ok(Term { measure, when })
+}
+
+/// A goal that was prepared for the model.
+fn goal(id: &str, field: &str, spec: &ModelSpec, goals: FindGoal<'_>) -> Result<Arc<Goal>, Error> {
+    let goal = goals(id)?;
+    if goal.model_hash == spec.hash {
+        return Ok(goal);
+    }
+    let found = format!("a goal for checkpoint {}", goal.model_hash);
+    let expected = format!("one for the session's, {}", spec.hash);
+    Err(Error::invalid(format!("{field}.goal_id"), found, expected))
+}
+
+/// Which part of a scene masks are of.
+///
+/// # Errors
+/// If it is not known.
+pub(super) fn part(part: i32, field: &str) -> Result<v1::MaskPart, Error> {
+    match v1::MaskPart::try_from(part) {
+        Ok(v1::MaskPart::Unspecified) => Ok(v1::MaskPart::AllObjects),
+        Ok(part) => Ok(part),
+        Err(_) => Err(Error::invalid(field, part, "a known part")),
+    }
 }
 
 fn subject(asked: Option<v1::Subject>, field: &str, spec: &ModelSpec) -> Result<Subject, Error> {

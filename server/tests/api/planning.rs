@@ -7,7 +7,7 @@ use serde_json::json;
 use tonic::{Code, Status};
 use tonic_types::StatusExt as _;
 
-use crate::support::{ACTION, TestServer, actions, f32_tensor, floats, outputs, rollout};
+use crate::support::{ACTION, TestServer, actions, f32_tensor, floats, outputs, rollout, u8_image};
 
 fn agent() -> Option<v1::Subject> {
     Some(v1::Subject { who: Some(Who::Agent(true)) })
@@ -263,5 +263,81 @@ async fn a_budget_gives_the_best_so_far() {
     let expected = if done < 100 { v1::StopReason::Budget } else { v1::StopReason::Iterations };
     assert!(answer.stop() == expected && done >= 1, "{done} iterations, {:?}", answer.stop());
     assert_eq!((answer.best_costs.len() as u32, answer.candidates), (done, 16 * done));
+    server.app.shutdown().await;
+}
+
+#[tokio::test]
+async fn goals_are_kept_and_reached() {
+    let server = TestServer::start().await;
+    let session = server.seasoned(4, 2).await;
+    let mut planning = server.planning.clone();
+    let wanted = Some(outputs(&[Output::Frame, Output::AgentMask], v1::Encoding::U8));
+    let request = v1::ImagineRequest { outputs: wanted, ..rollout(&session, 4, 3) };
+    // What the third candidate leads to is the goal.
+    let mut frame = Vec::new();
+    let mut mask = Vec::new();
+    for chunk in server.imagine(request).await.unwrap() {
+        let from = chunk.first_candidate;
+        if chunk.depths != [3] || !(from..from + chunk.candidates).contains(&2) {
+            continue;
+        }
+        for (value, to) in chunk.outputs.iter().zip([&mut frame, &mut mask]) {
+            let Some(Value::Tensor(tensor)) = &value.value else { panic!("pictures are tensors") };
+            let bytes = tensor.data.len() / chunk.candidates as usize;
+            *to = tensor.data[(2 - from) as usize * bytes..][..bytes].to_vec();
+        }
+    }
+    let masks = v1::MaskGoal {
+        part: v1::MaskPart::Agent.into(),
+        masks: Some(v1::Tensor {
+            dtype: v1::DataType::U8.into(),
+            shape: vec![64, 64],
+            data: mask.into(),
+            values: vec![],
+        }),
+        object_ids: vec![],
+    };
+    let request = v1::PutGoalRequest {
+        image: Some(u8_image(64, 64, frame)),
+        masks: vec![masks.clone()],
+        ..Default::default()
+    };
+    let goal = planning.put_goal(request).await.unwrap().into_inner().goal.unwrap();
+    assert!(goal.has_image && goal.parts == [v1::MaskPart::Agent as i32], "{goal:?}");
+    let last = |measure| v1::CostTerm { when: v1::When::LastStep.into(), ..term(measure) };
+    let image = |pixels: v1::Pixels| {
+        last(Measure::GoalImage(v1::GoalImage { goal_id: goal.id.clone(), pixels: pixels.into() }))
+    };
+    let agent_mask = last(Measure::GoalMasks(v1::GoalMasks {
+        goal_id: goal.id.clone(),
+        part: v1::MaskPart::Agent.into(),
+    }));
+    for term in [
+        image(v1::Pixels::All),
+        image(v1::Pixels::Agent),
+        image(v1::Pixels::Background),
+        agent_mask.clone(),
+    ] {
+        let answer = planning.score(score(&session, vec![term])).await.unwrap().into_inner();
+        let found = floats(&answer.costs.unwrap());
+        assert!(answer.best == 2 && found[2] < 1e-6 && found[0] > found[2], "{found:?}");
+    }
+
+    let refused = async |request: v1::PutGoalRequest| {
+        field(&server.planning.clone().put_goal(request).await.unwrap_err())
+    };
+    assert_eq!(refused(v1::PutGoalRequest::default()).await, "image");
+    let flat = v1::MaskGoal { part: v1::MaskPart::EachObject.into(), ..masks };
+    let flat = v1::PutGoalRequest { masks: vec![flat], ..Default::default() };
+    assert_eq!(refused(flat).await, "masks[0].masks.shape");
+    let objects = last(Measure::GoalMasks(v1::GoalMasks { goal_id: goal.id.clone(), part: 0 }));
+    let status = planning.score(score(&session, vec![objects])).await.unwrap_err();
+    assert_eq!(field(&status), "costs.terms[0].goal_masks.goal_id");
+
+    let path = format!("/v1/goals/{}", goal.id);
+    assert_eq!(server.delete(&path).send().await.unwrap().status(), 200);
+    assert_eq!(server.delete(&path).send().await.unwrap().status(), 404);
+    let status = planning.score(score(&session, vec![agent_mask])).await.unwrap_err();
+    assert_eq!((status.code(), status.message().contains(&goal.id)), (Code::NotFound, true));
     server.app.shutdown().await;
 }

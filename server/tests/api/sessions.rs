@@ -164,9 +164,9 @@ async fn health_readiness_metrics_and_reflection_are_there() {
 #[tokio::test]
 async fn what_is_not_there_yet_says_so() {
     let server = TestServer::start().await;
-    let answer = server.put("/v1/goals").json(&json!({})).send().await.unwrap();
-    let (status, problem) =
-        (answer.status().as_u16(), answer.json::<serde_json::Value>().await.unwrap());
+    let session = server.session(1).await;
+    let path = format!("/v1/sessions/{}/rollouts", session.id);
+    let (status, problem) = server.post_json(&path, &json!({"costs": {}})).await;
     assert_eq!((status, problem["reason"].as_str()), (501, Some("UNIMPLEMENTED")));
     server.app.shutdown().await;
 }

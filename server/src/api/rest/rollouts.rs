@@ -1,4 +1,4 @@
-//! Paths of rollouts and plans.
+//! Paths of rollouts, plans and goals.
 
 use std::convert::Infallible;
 
@@ -73,6 +73,25 @@ pub(super) async fn plan(
         service.find_plan(request, call).await
     });
     Ok(accept.answer(&answer.await?))
+}
+
+pub(super) async fn put_goal(
+    State(service): App,
+    accept: Accept,
+    body: Result<In<v1::PutGoalRequest>, Error>,
+) -> Result<Response, Error> {
+    let answer = answer("PutGoal", async { service.put_goal(body?.0).await }).await?;
+    Ok(accept.answer(&answer))
+}
+
+pub(super) async fn delete_goal(
+    State(service): App,
+    Path(goal_id): Path<String>,
+    accept: Accept,
+) -> Result<Response, Error> {
+    let request = v1::DeleteGoalRequest { goal_id };
+    let answer = answer("DeleteGoal", async { service.delete_goal(&request) }).await?;
+    Ok(accept.answer(&answer))
 }
 
 /// All chunks in one document.
