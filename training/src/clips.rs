@@ -10,9 +10,11 @@ use crate::evaluation::Recorded;
 /// Levels (of 255) by which shadows darken a channel: their peak in the histogram is looked for here.
 const SHADOWS: std::ops::Range<usize> = 5..64;
 
-/// Shadows only darken, and near where the robot rests they lie longer than not: a median would keep them. The
-/// background is this quantile of a pixel's values instead.
-const BACKGROUND_QUANTILE: f64 = 0.65;
+/// A level that a pixel has this often, as a share of its most frequent one, is one that it returns to.
+const LASTING: f64 = 0.25;
+
+/// Levels (of 255) that the flank of a level's peak spans.
+const FLANK: i64 = 6;
 
 /// What is brighter than the background by more than this is no noise, in [0, 1].
 const NOISE: f64 = 0.06;
@@ -21,7 +23,7 @@ const NOISE: f64 = 0.06;
 #[derive(Debug)]
 pub struct Clips {
     episodes: Vec<Episode>,
-    /// The image behind all that moves, `[3, H, W]` in [0, 1]: a quantile of each pixel over the data set.
+    /// The image behind all that moves, `[3, H, W]` in [0, 1]: the brightest level that each pixel returns to.
     pub background: Tensor,
     /// What is darker than the background by up to this counts as shadow, in [0, 1]; found in the data.
     pub shadow: f64,
@@ -183,10 +185,29 @@ fn sample(episodes: &[(Tensor, Tensor)]) -> Tensor {
     Tensor::cat(&sample, 0)
 }
 
-/// `BACKGROUND_QUANTILE` of every pixel of a sample `[N, 3, H, W]`, `[3, H, W]` in [0, 255].
+/// The brightest level that every pixel of a sample `[N, 3, H, W]` returns to, `[3, H, W]` in [0, 255].
+///
+/// What moves passes a pixel with many levels; the background and the shadow on it come back. Shadows only darken, and
+/// near where the robot rests they lie longer than not, so the most frequent level would keep them.
 fn background(sample: &Tensor) -> Tensor {
-    let rank = (sample.size()[0] as f64 * BACKGROUND_QUANTILE) as i64;
-    sample.sort(0, false).0.select(0, rank).to_kind(Kind::Float)
+    let size = sample.size();
+    let pixels = sample.view([size[0], -1]).to_kind(Kind::Int64);
+    let options = (Kind::Float, sample.device());
+    let counts = Tensor::zeros([256, pixels.size()[1]], options).scatter_add_(
+        0,
+        &pixels,
+        &Tensor::ones(pixels.size(), options),
+    );
+    // Twice over three levels: a triangle, so that a single level stays the top of its own peak.
+    let smooth = |x: &Tensor| x.avg_pool1d([3], [1], [1], false, true);
+    let near = smooth(&smooth(&counts.transpose(0, 1).unsqueeze(1))).squeeze_dim(1); // [3 H W, 256]
+    let lasting = near.ge_tensor(&(near.amax(1, true) * LASTING)).to_kind(Kind::Int64);
+    let levels = Tensor::arange(256, (Kind::Int64, sample.device()));
+    let brightest = (lasting * &levels).amax(1, true);
+    // The brightest lasting level is the upper flank of its peak; the background is the top.
+    let flank = levels.le_tensor(&brightest).logical_and(&levels.gt_tensor(&(&brightest - FLANK)));
+    let top = near.where_self(&flank, &near.zeros_like()).argmax(1, false);
+    top.view(&size[1..]).to_kind(Kind::Float)
 }
 
 /// The foot behind the peak that shadows make in the histogram of darkening, in [0, 1].
@@ -247,16 +268,14 @@ mod tests {
     }
 
     #[test]
-    fn a_shadow_that_lies_longer_than_not_is_no_background() {
+    fn neither_a_lasting_shadow_nor_what_passes_is_background() {
         let sample = Tensor::full([100, 3, 2, 2], 150, (Kind::Uint8, Device::Cpu));
         let _ = sample.narrow(0, 0, 60).fill_(120);
-        assert!(
-            background(&sample)
-                .eq_tensor(&Tensor::full([3, 2, 2], 150.0, (Kind::Float, Device::Cpu)))
-                .all()
-                .int64_value(&[])
-                == 1
-        );
+        for passing in 0..20 {
+            let _ = sample.get(80 + passing).fill_(160 + passing * 4);
+        }
+        let found: Vec<f32> = background(&sample).flatten(0, -1).try_into().expect("levels");
+        assert!(found.iter().all(|level| (level - 150.0).abs() < 1.0), "{found:?}");
     }
 
     #[test]

@@ -17,7 +17,9 @@ use crate::{
     engine::commands::{Chunk, Depths, Form, Imagine, NumberType, Spent, Tenant, Urgency, Wanted},
     error::Error,
     planning::{
-        cost::{Measured, Pictures, Program, Scores, Seen, Size, Step},
+        cost::Program,
+        measure::{Pictures, Seen, Step},
+        scores::{Measured, Scores, Size},
         search::{Rank, Search, Space},
     },
     sessions::session::{Planned, Position, Session},
