@@ -134,7 +134,7 @@ impl Clips {
             let none = e.actions.narrow(0, 0, 1).zeros_like();
             Tensor::cat(&[none, e.actions.narrow(0, 0, length - 1)], 0)
         });
-        Recorded { frames, actions, labels: None }
+        Recorded { frames, actions, labels: None, contacts: None }
     }
 
     /// The batch of step `step`: a function of its arguments alone.

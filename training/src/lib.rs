@@ -1,6 +1,8 @@
 //! Training and evaluation of GATSBI world models.
 
+pub mod ablation;
 pub mod adam;
+pub mod agent_slot;
 pub mod clips;
 pub mod evaluation;
 pub mod events;
@@ -10,3 +12,4 @@ pub mod recipe;
 pub mod saved;
 pub mod trainer;
 pub mod untrained;
+pub mod variant;

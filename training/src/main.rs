@@ -17,6 +17,7 @@ use gatsbi_models::{
     world_model::WorldModel as _,
 };
 use gatsbi_training::{
+    ablation::{self, Ablation},
     clips::Clips,
     evaluation::{
         CONDITIONING, Draw, Recorded,
@@ -28,6 +29,7 @@ use gatsbi_training::{
     recipe::Recipe,
     trainer::Trainer,
     untrained,
+    variant::Variant,
 };
 use indicatif::ProgressBar;
 use tch::Device;
@@ -77,6 +79,38 @@ enum Command {
         /// Checkpoint whose weights to start from.
         #[arg(long)]
         from: Option<PathBuf>,
+        /// Where to train: cpu, or cuda:N.
+        #[arg(long, default_value = "cpu", value_parser = device)]
+        device: Device,
+    },
+    /// Train variants of a recipe for the same steps, and print the table of what they reach.
+    ///
+    /// A run that was stopped goes on; one that is done is measured again.
+    Ablate {
+        /// Recipe: a file, or roll, push1, push2, bair, balls or tiny.
+        #[arg(long)]
+        recipe: String,
+        /// Variants to compare.
+        #[arg(long, value_delimiter = ',', required = true)]
+        variants: Vec<Variant>,
+        /// Data set.
+        #[arg(long)]
+        episodes: PathBuf,
+        /// Episodes to train on, from and up to (excluded).
+        #[arg(long, num_args = 2, required = true)]
+        range: Vec<usize>,
+        /// Episodes to measure on, from and up to (excluded).
+        #[arg(long, num_args = 2, required = true)]
+        test: Vec<usize>,
+        /// Steps that each variant is trained for; those of the recipe at most.
+        #[arg(long)]
+        steps: u64,
+        /// Seed of every run.
+        #[arg(long, default_value_t = 0)]
+        seed: u64,
+        /// Folder: a run per variant, and table.md.
+        #[arg(long)]
+        out: PathBuf,
         /// Where to train: cpu, or cuda:N.
         #[arg(long, default_value = "cpu", value_parser = device)]
         device: Device,
@@ -140,12 +174,43 @@ fn main() -> anyhow::Result<()> {
             let dataset = Dataset::open(&episodes)?;
             let range = episodes_in(&dataset, range)?;
             let clips = Clips::read(&dataset, range.clone())?;
-            let data = format!("{} episodes {}..{}", dataset.info().name, range.start, range.end);
+            let data = data_name(&dataset, &range);
             let mut trainer = Trainer::open(recipe, &clips, &data, seed, &out, device)?;
             if let Some(from) = from {
                 trainer.start_from(&from)?;
             }
             trainer.run(&clips, None)?;
+        }
+        Command::Ablate { recipe, variants, episodes, range, test, steps, seed, out, device } => {
+            tch::set_num_threads(1);
+            let recipe = Recipe::load(&recipe)?;
+            let dataset = Dataset::open(&episodes)?;
+            let range = episodes_in(&dataset, Some(range))?;
+            let test = episodes_in(&dataset, Some(test))?;
+            ensure!(
+                test.end <= range.start || range.end <= test.start,
+                "variants are trained on {range:?} and measured on {test:?}, expected no episode \
+                 in both"
+            );
+            let clips = Clips::read(&dataset, range.clone())?;
+            let data = data_name(&dataset, &range);
+            let ablation = Ablation {
+                recipe: &recipe,
+                steps,
+                clips: &clips,
+                data: &data,
+                seed,
+                device,
+                test: (&dataset, test),
+                horizon: HORIZON,
+            };
+            let mut measured = Vec::new();
+            for variant in variants {
+                let report = ablation.measure(variant, &out.join(variant.name()))?;
+                measured.push((variant, report));
+                fs_err::write(out.join("table.md"), ablation::table(&measured))?;
+            }
+            print!("{}", ablation::table(&measured));
         }
         Command::Eval { checkpoint, episodes, range, evaluation } => {
             tch::set_num_threads(1);
@@ -162,6 +227,10 @@ fn device(text: &str) -> Result<Device, String> {
         (_, Some(Ok(_))) => Err("this libtorch sees no CUDA device".to_owned()),
         _ => Err("expected cpu or cuda:N".to_owned()),
     }
+}
+
+fn data_name(dataset: &Dataset, range: &Range<usize>) -> String {
+    format!("{} episodes {}..{}", dataset.info().name, range.start, range.end)
 }
 
 /// The asked range of episodes, all without one.

@@ -16,6 +16,7 @@ use tch::{Device, Kind, Tensor};
 use crate::{
     clips::Batch,
     recipe::{KeypointRecipe, MixtureRecipe, ObjectRecipe, Ramp, Recipe, RegressionRecipe},
+    variant::Variant,
 };
 
 /// Where a run is: everything random about a step is a function of this.
@@ -121,7 +122,12 @@ pub fn objective(
         (Some(weights), Some(learning), Some(detector)) => {
             let found: Vec<Keypoints> =
                 batch.frames.iter().map(|frame| detector.forward(frame)).collect();
-            add_keypoints(&mut terms, model, learning, weights, batch, &found, moment);
+            let actions = batch.actions.iter().map(|action| model.enhance(action));
+            let actions: Vec<Tensor> = match recipe.variant {
+                Variant::KeypointsApart => actions.map(|action| action.detach()).collect(),
+                _ => actions.collect(),
+            };
+            add_keypoints(&mut terms, learning, weights, (batch, &actions), &found, moment);
             Some(found.iter().map(|found| detector.gamma(found)).collect::<Vec<_>>())
         }
         _ => None,
@@ -134,17 +140,15 @@ pub fn objective(
 
 fn add_keypoints(
     terms: &mut Terms,
-    model: &Gatsbi,
     learning: &KeypointLearning,
     weights: &KeypointRecipe,
-    batch: &Batch,
+    (batch, actions): (&Batch, &[Tensor]),
     found: &[Keypoints],
     moment: Moment,
 ) {
     let rows = batch.frames[0].size()[0];
     let device = batch.frames[0].device();
     let networks = &weights.networks;
-    let actions: Vec<Tensor> = batch.actions.iter().map(|action| model.enhance(action)).collect();
     // Keypoints draw from a stream of their own.
     let moment = Moment { seed: !moment.seed, ..moment };
     let noise: Vec<Tensor> = (0..batch.frames.len())
@@ -153,7 +157,7 @@ fn add_keypoints(
             noise(moment, t, rows, device).normal(Site::Mask, &shape).transpose(0, 1)
         })
         .collect();
-    let losses = learning.losses(&batch.frames, found, &actions, &noise);
+    let losses = learning.losses(&batch.frames, found, actions, &noise);
     let per_row = |x: Tensor| x.expand([rows], false);
     terms.add("kp_image", per_row(losses.image), 1.0);
     terms.add("kp_separation", per_row(losses.separation), weights.separation);

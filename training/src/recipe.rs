@@ -8,6 +8,8 @@ use anyhow::{Context as _, ensure};
 use gatsbi_models::gatsbi::keypoint::KeypointLearningConfig;
 use serde::{Deserialize, Serialize};
 
+use crate::variant::Variant;
+
 /// Recipes that are known by name.
 const NAMED: [(&str, &str); 6] = [
     ("roll", include_str!("../recipes/roll.toml")),
@@ -26,6 +28,9 @@ pub struct Recipe {
     pub name: String,
     /// Architecture preset.
     pub model: String,
+    /// What is different about that architecture, for ablations.
+    #[serde(default)]
+    pub variant: Variant,
     /// Optimiser steps.
     pub steps: u64,
     /// Sequences per step.

@@ -16,12 +16,14 @@ use gatsbi_models::{
         world::GatsbiWorld,
     },
     nn::ParamStore,
+    noise::PhiloxNoise,
     world_model::WorldModel as _,
 };
 use tch::{Device, Kind};
 
 use crate::{
     adam::{self, Adam},
+    agent_slot::Vote,
     clips::{Batch, Clips},
     evaluation::{self, Draw, Recorded},
     journal::Journal,
@@ -36,6 +38,9 @@ const MAX_SKIPPED_IN_A_ROW: u64 = 5;
 
 /// Batches whose statistics replace the running ones before a checkpoint is written for users.
 const RECALIBRATION_BATCHES: u64 = 30;
+
+/// Batches whose frames vote for the agent's slot.
+const VOTING_BATCHES: u64 = 20;
 
 /// Optimiser steps of the prefit draw from steps of their own, far from those of the run.
 const PREFIT_STEPS: u64 = 1 << 40;
@@ -76,6 +81,7 @@ impl Trainer {
             clips.shortest()
         );
         model.action.dim = clips.actions.len() as i64;
+        recipe.variant.apply(&mut model);
         if let Some(bounds) = recipe.objects.as_ref().and_then(|objects| objects.scale_bounds) {
             model.tracking.scale_bounds = Some(bounds);
         }
@@ -185,6 +191,7 @@ impl Trainer {
             self.progress.seconds += started.elapsed().as_secs_f64();
             if self.progress.step == self.recipe.steps {
                 self.recalibrate(clips);
+                self.check_agent_slot(clips, &journal);
             }
             let every = |steps: u64| steps > 0 && self.progress.step.is_multiple_of(steps);
             if every(self.recipe.save_every) || self.progress.step == end {
@@ -225,7 +232,8 @@ impl Trainer {
         ensure!(*seed == self.progress.seed, "{} has seed {seed}", path.display());
         ensure!(*data == self.progress.data, "{} is a run on {data}", path.display());
         ensure!(
-            recipe.model == self.recipe.model && recipe.batch == self.recipe.batch,
+            (&recipe.model, recipe.variant, recipe.batch)
+                == (&self.recipe.model, self.recipe.variant, self.recipe.batch),
             "{} is a run of another recipe",
             path.display()
         );
@@ -246,14 +254,7 @@ impl Trainer {
         let mut adam = Adam::default();
         for step in PREFIT_STEPS..PREFIT_STEPS + prefit.steps {
             let batch = self.batch(clips, step, 1);
-            let how = Observing {
-                train: true,
-                priors: false,
-                objects: false,
-                discover: Discover::None,
-                tracking: training_tracking(None),
-                stops: GradientStops::default(),
-            };
+            let how = slots_alone(true);
             let noise = noise(Moment { step, ..self.moment() }, 0, rows, self.device);
             let state = model.initial_state(rows);
             let (_, seen) = model.observe(state, &batch.frames[0], &batch.actions[0], &noise, how);
@@ -283,6 +284,42 @@ impl Trainer {
         }
     }
 
+    /// Measures how well the agent slot's mask agrees with the map that led it, and says so if another slot's agrees
+    /// clearly better.
+    fn check_agent_slot(&mut self, clips: &Clips, journal: &Journal) {
+        let Some(slot) = self.checkpoint.model.agent_slot() else { return };
+        let vote = self.vote(clips);
+        journal.say(&format!("agreement with the map of the agent: {vote}"));
+        if let Some(other) = vote.contradicts(slot as usize) {
+            journal.say(&format!("the agent is slot {slot}, but slot {other} agrees better"));
+        }
+        let score = Some(vote.agreement(slot as usize));
+        self.checkpoint.header.agent_slot = Some(AgentSlot { index: slot, score });
+    }
+
+    fn vote(&self, clips: &Clips) -> Vote {
+        let _no_grad = tch::no_grad_guard();
+        let model = &self.checkpoint.model;
+        let mut vote = Vote::new(model.config().mixture.slots as usize);
+        let detector = model.detector().filter(|_| self.recipe.keypoints.is_some());
+        for i in 0..VOTING_BATCHES {
+            let step = 3 * PREFIT_STEPS + i;
+            let batch = self.batch(clips, step, self.recipe.length.at(0) as i64);
+            let rows = batch.frames[0].size()[0];
+            let noise = PhiloxNoise::mean(rows, self.device);
+            let mut state = model.initial_state(rows);
+            for (t, frame) in batch.frames.iter().enumerate() {
+                let (next, seen) =
+                    model.observe(state, frame, &batch.actions[t], &noise, slots_alone(false));
+                state = next;
+                let gamma = detector.map(|detector| detector.gamma(&detector.forward(frame)));
+                let masks = seen.mixture.log_masks.exp().squeeze_dim(2);
+                vote.add(&masks, gamma.as_ref().unwrap_or(&batch.motion[t]));
+            }
+        }
+        vote
+    }
+
     fn save(&self) -> anyhow::Result<()> {
         let stores = [&self.checkpoint.store, &self.learning_store];
         saved::save(&self.state_path(), &stores, &self.adam, &self.progress)
@@ -290,9 +327,7 @@ impl Trainer {
 
     /// Writes the checkpoint that users see.
     fn export(&self) -> anyhow::Result<()> {
-        let agent_slot = self.checkpoint.header.agent_slot.clone();
         let header = Header {
-            agent_slot: agent_slot.map(|slot| AgentSlot { score: None, ..slot }),
             provenance: Provenance {
                 data: self.progress.data.clone(),
                 seed: self.progress.seed,
@@ -325,5 +360,17 @@ impl Trainer {
         let size = image::image_dimensions(&path)?;
         journal.events().picture(self.progress.step, "rollout", &png, [size.1, size.0])?;
         Ok(())
+    }
+}
+
+/// Slots are observed without objects and without priors.
+fn slots_alone(train: bool) -> Observing {
+    Observing {
+        train,
+        priors: false,
+        objects: false,
+        discover: Discover::None,
+        tracking: training_tracking(None),
+        stops: GradientStops::default(),
     }
 }

@@ -2,14 +2,14 @@
 
 use gatsbi_models::{
     checkpoint::{AgentSlot, FirstAction, Header, Provenance},
-    config::{GatsbiConfig, Interaction},
+    config::GatsbiConfig,
     world_model::{ActionDimension, Preprocess},
 };
 
 /// The header of an untrained model called `name`. Scenes with an agent get slot 0 for it, the only slot that
 /// sees the action directly (decisions row 4).
 pub fn header(name: &str, model: GatsbiConfig, actions: Vec<ActionDimension>, seed: u64) -> Header {
-    let has_agent = model.objects.interaction != Interaction::Inter1;
+    let has_agent = model.action.dim > 0;
     Header {
         name: name.to_owned(),
         agent_slot: has_agent.then_some(AgentSlot { index: 0, score: None }),

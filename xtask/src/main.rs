@@ -3,9 +3,10 @@
 //! It must build before libtorch is there and is the first thing a newcomer waits for, so it depends on
 //! none of our crates and on few others. Read on in [`setup`], which provides libtorch, [`cargo`], which runs
 //! the checks and builds, and [`demo`], which shows the whole; [`twin`] and [`mod@bench`] hold the model against a second
-//! one in PyTorch. [`process`] looks after programs that run beside it.
+//! one in PyTorch, [`mod@bundle_train`] takes training elsewhere. [`process`] looks after programs that run beside it.
 
 mod bench;
+mod bundle_train;
 mod cargo;
 mod demo;
 mod libtorch;
@@ -65,6 +66,8 @@ enum Command {
     ///
     /// Both have the same weights and take turns, so that what else the machine does hits both; rely on the ratios.
     Bench(bench::Arguments),
+    /// Make a folder that trains on another machine, which needs PyTorch 2.11 for Python and nothing else
+    BundleTrain(bundle_train::Arguments),
     /// Provide the pretrained networks of the perceptual metrics (110 MB to download); prints the file for gatsbi-train eval
     Metrics,
     /// Format the sources
@@ -93,6 +96,7 @@ fn run(command: Command) -> Result<()> {
         Command::Lint => cargo::lint(root),
         Command::Twin { presets } => twin::agree(root, &presets),
         Command::Bench(arguments) => bench::bench(root, &arguments),
+        Command::BundleTrain(arguments) => bundle_train::bundle(root, &arguments),
         Command::Metrics => metrics::provide(),
         Command::Fmt => cargo::fmt(root),
     }

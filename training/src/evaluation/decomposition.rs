@@ -69,22 +69,22 @@ pub struct ObjectCounts {
     pub distance: f64,
 }
 
-/// Matches the objects of row `row` one to one, nearest pairs first.
-pub fn match_objects(scene: &Scene, labels: &Tensor, row: i64) -> (ObjectCounts, Vec<(i64, i64)>) {
+/// Identities and centres, in pixels, of the objects of row `row` whose presence is above 1/2. `side` is the image's.
+pub fn found_objects(scene: &Scene, row: i64, side: f64) -> Vec<(i64, [f64; 2])> {
     let table = scene.objects.as_ref().expect("objects were asked for");
     let values: Vec<Vec<f32>> = table.values.get(row).try_into().expect("a table of floats");
     let ids: Vec<i64> = table.ids.get(row).try_into().expect("a row of identities");
-    let labels = labels.get(row);
-    let side = labels.size()[0] as f64;
-    let found: Vec<(i64, [f64; 2])> = values
+    let pixel = |x: f32| (f64::from(x) + 1.0) * side / 2.0 - 0.5;
+    values
         .iter()
         .zip(ids)
         .filter(|(object, _)| object[0] > 0.5)
-        .map(|(object, id)| {
-            let pixel = |x: f32| (f64::from(x) + 1.0) * side / 2.0 - 0.5;
-            (id, [pixel(object[1]), pixel(object[2])])
-        })
-        .collect();
+        .map(|(object, id)| (id, [pixel(object[1]), pixel(object[2])]))
+        .collect()
+}
+
+/// Labels and centres, in pixels, of the true objects in labels `[H, W]` that are visible enough.
+pub fn true_objects(labels: &Tensor) -> Vec<(i64, [f64; 2])> {
     let mut truth = Vec::new();
     for label in 2..=labels.max().int64_value(&[]) {
         let pixels = labels.eq(label).nonzero();
@@ -97,6 +97,14 @@ pub fn match_objects(scene: &Scene, labels: &Tensor, row: i64) -> (ObjectCounts,
             truth.push((label, [centre[1], centre[0]]));
         }
     }
+    truth
+}
+
+/// Matches the objects of row `row` one to one, nearest pairs first.
+pub fn match_objects(scene: &Scene, labels: &Tensor, row: i64) -> (ObjectCounts, Vec<(i64, i64)>) {
+    let labels = labels.get(row);
+    let found = found_objects(scene, row, labels.size()[0] as f64);
+    let truth = true_objects(&labels);
     let mut pairs = Vec::new();
     for (i, (_, a)) in found.iter().enumerate() {
         for (j, (_, b)) in truth.iter().enumerate() {

@@ -2,6 +2,7 @@
 
 pub mod decomposition;
 pub mod images;
+pub mod interaction;
 pub mod perceptual;
 pub mod picture;
 pub mod plot;
@@ -17,6 +18,8 @@ use gatsbi_models::{
 };
 use tch::{Device, Kind, Tensor};
 
+use interaction::Contacts;
+
 /// Frames that are observed before imagining starts (paper's protocol).
 pub const CONDITIONING: usize = 5;
 
@@ -29,6 +32,8 @@ pub struct Recorded {
     pub actions: Vec<Tensor>,
     /// `[T]` labels of `[B, H, W]` int64, where the data has them.
     pub labels: Option<Vec<Tensor>>,
+    /// `[B]`, what touched what, where the data says it.
+    pub contacts: Option<Vec<Contacts>>,
 }
 
 impl Recorded {
@@ -69,7 +74,8 @@ impl Recorded {
                 Tensor::from_slice(mask).view([height, width]).to_kind(Kind::Int64)
             })
         });
-        Ok(Self { frames, actions, labels })
+        let contacts = read.iter().map(Contacts::of).collect();
+        Ok(Self { frames, actions, labels, contacts })
     }
 }
 

@@ -15,6 +15,7 @@ use tch::Tensor;
 
 use super::{
     CONDITIONING, Draw, Recorded, decomposition, images,
+    interaction::Followed,
     perceptual::{Perceptual, frechet_distance},
     rollout,
     statistics::{Estimate, PerEpisode},
@@ -153,6 +154,7 @@ pub fn report(
         let others = rollout(world, &recorded, &swapped, Draw::Mean, only_frames);
         let first_episode = chunk * BATCH;
         let mut identities = HashMap::new();
+        let mut followed = Vec::new();
         for t in 0..length {
             let at = At { t, first_episode };
             add_images(&mut tally, &recorded, &scenes, &others, at);
@@ -160,7 +162,13 @@ pub fn report(
                 add_perceptual(&mut tally, perceptual, &recorded, &scenes, at);
             }
             if recorded.labels.is_some() {
-                add_decomposition(&mut tally, &recorded, &scenes[t], spec, at, &mut identities);
+                let matches =
+                    add_decomposition(&mut tally, &recorded, &scenes[t], spec, at, &mut identities);
+                if t + 1 == CONDITIONING {
+                    followed = matches.iter().map(|matches| Followed::new(matches)).collect();
+                } else if t >= CONDITIONING {
+                    add_interactions(&mut tally, &recorded, &scenes[t], at, &mut followed);
+                }
             }
         }
         let sampled: Vec<Vec<Scene>> = (0..samples)
@@ -318,6 +326,7 @@ fn add_images(tally: &mut Tally, recorded: &Recorded, scenes: &[Scene], others: 
     }
 }
 
+/// Returns the `(label, identity)` pairs of every row.
 fn add_decomposition(
     tally: &mut Tally,
     recorded: &Recorded,
@@ -325,7 +334,8 @@ fn add_decomposition(
     spec: &gatsbi_models::world_model::ModelSpec,
     at: At,
     identities: &mut HashMap<(usize, i64), i64>,
-) {
+) -> Vec<Vec<(i64, i64)>> {
+    let mut pairs = Vec::new();
     let labels = &recorded.labels.as_ref().expect("the caller checked")[at.t];
     let segmentation = decomposition::segmentation(scene);
     let phase = at.phase();
@@ -354,10 +364,34 @@ fn add_decomposition(
         ratio("object_recall", matched, counts.truth);
         ratio("object_precision", matched, counts.found);
         ratio("object_position_px", counts.distance, counts.matched);
-        for (label, id) in matches {
+        for &(label, id) in &matches {
             if let Some(before) = identities.insert((episode, label), id) {
                 ratio("identity_switches", f64::from(u8::from(before != id)), 1);
             }
+        }
+        pairs.push(matches);
+    }
+    pairs
+}
+
+/// Position errors of followed objects, before and after something touched them.
+fn add_interactions(
+    tally: &mut Tally,
+    recorded: &Recorded,
+    scene: &Scene,
+    at: At,
+    followed: &mut [Followed],
+) {
+    let (Some(contacts), Some(labels)) = (&recorded.contacts, &recorded.labels) else { return };
+    for (row, (followed, contacts)) in followed.iter_mut().zip(contacts).enumerate() {
+        let labels = labels[at.t].get(row as i64);
+        let distances = followed.step(at.t, contacts, scene, &labels, row as i64);
+        for (name, distances) in [
+            ("object_px_before_interaction", distances.before),
+            ("object_px_after_interaction", distances.after),
+        ] {
+            let sum: f64 = distances.iter().sum();
+            tally.ratio(name, at.first_episode + row, sum, distances.len() as f64);
         }
     }
 }
