@@ -259,7 +259,9 @@ mod tests {
         }
         let plain = decoder.output.forward(&x);
         assert_eq!(plain.size(), [2, 3, 64, 64]);
-        assert!(max_difference(&closed, &plain) < 1e-5);
+        // Sums of 600 products in another order: 1.1e-5 with AVX2, less with AVX-512.
+        let difference = max_difference(&closed, &plain);
+        assert!(difference < 2e-5, "{difference:e}");
 
         let unfolded = decoder.forward(&z, false);
         decoder.freeze();
