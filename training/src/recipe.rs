@@ -11,13 +11,14 @@ use serde::{Deserialize, Serialize};
 use crate::variant::Variant;
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 6] = [
+const NAMED: [(&str, &str); 7] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
     ("bair", include_str!("../recipes/bair.toml")),
     ("balls", include_str!("../recipes/balls.toml")),
     ("tiny", include_str!("../recipes/tiny.toml")),
+    ("tiny-refine", include_str!("../recipes/tiny-refine.toml")),
 ];
 
 /// How a model is trained.
@@ -319,6 +320,6 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("roll, push1, push2, bair, balls, tiny"), "{error}");
+        assert!(error.contains("roll, push1, push2, bair, balls, tiny, tiny-refine"), "{error}");
     }
 }
