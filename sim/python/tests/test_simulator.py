@@ -43,7 +43,7 @@ class SimulatorTest(unittest.TestCase):
             for ask, sentence in [
                 (lambda: scene.step([]), "the scene was not reset yet"),
                 (lambda: scene.step([0.5]), "an action of balls3 has 0 numbers, not 1"),
-                (lambda: scene.set_goal([]), "nobody acts in balls3, so it takes no goal"),
+                (lambda: scene.set_goal([]), "nobody acts in balls3, so it takes neither goals nor candidates"),
             ]:
                 with self.assertRaises(SimulatorError) as refused:
                     ask()
