@@ -21,7 +21,8 @@ def test_generated_files_are_current(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("snippet", re.findall(r"```python\n(.*?)```", (HERE / "README.md").read_text(), re.S))
-def test_readme(snippet, address, frames):
+def test_readme(snippet, address, frames, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     exec(snippet, {"address": address, "frames": frames})
 
 
