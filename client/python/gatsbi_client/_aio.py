@@ -324,19 +324,23 @@ class AsyncStream:
             await asyncio.sleep(wait)
 
     async def _exchange(self, call: core.Call[t.Belief]) -> t.Belief:
-        if self._answers is None:
-            self._answers = aiter(self._open(call))
+        answers = self._answers or aiter(self._open(call))
+        # Who breaks off the wait leaves an answer behind: unless it has come, the next one opens another stream.
+        self._answers = None
         await self._requests.put(call.request)
         try:
-            return call.parse(await anext(self._answers))
+            answer = await anext(answers)
         except grpc.RpcError as failed:
             await self.close()
             raise core.translate(failed) from failed
         except StopAsyncIteration as ended:
             await self.close()
             raise errors.Unavailable("the server ended the stream", code=grpc.StatusCode.UNAVAILABLE) from ended
+        self._answers = answers
+        return call.parse(answer)
 
     def _open(self, call: core.Call[t.Belief]) -> AsyncIterable[ObserveStreamResponse]:
+        self._requests.put_nowait(None)
         self._requests = asyncio.Queue()
         invoke = self._session._client._channel.stream_stream(
             f"/gatsbi.v1.{call.method}", ObserveStreamRequest.SerializeToString, call.answer.FromString

@@ -324,19 +324,23 @@ class Stream:
             time.sleep(wait)
 
     def _exchange(self, call: core.Call[t.Belief]) -> t.Belief:
-        if self._answers is None:
-            self._answers = iter(self._open(call))
+        answers = self._answers or iter(self._open(call))
+        # Who breaks off the wait leaves an answer behind: unless it has come, the next one opens another stream.
+        self._answers = None
         self._requests.put(call.request)
         try:
-            return call.parse(next(self._answers))
+            answer = next(answers)
         except grpc.RpcError as failed:
             self.close()
             raise core.translate(failed) from failed
         except StopIteration as ended:
             self.close()
             raise errors.Unavailable("the server ended the stream", code=grpc.StatusCode.UNAVAILABLE) from ended
+        self._answers = answers
+        return call.parse(answer)
 
     def _open(self, call: core.Call[t.Belief]) -> Iterable[ObserveStreamResponse]:
+        self._requests.put_nowait(None)
         self._requests = queue.Queue()
         invoke = self._session._client._channel.stream_stream(
             f"/gatsbi.v1.{call.method}", ObserveStreamRequest.SerializeToString, call.answer.FromString

@@ -61,6 +61,23 @@ def test_a_session_that_is_deleted_ends_its_stream_with_a_typed_error(client, fr
             stream.observe(frames[1], np.zeros(dimension))
 
 
+def test_a_wait_that_is_broken_off_leaves_no_answer_behind(address, frames, dimension):
+    async def run():
+        async with gc.AsyncClient(address) as client, await client.create_session() as s, s.stream() as stream:
+            await stream.observe(frames[0])
+            for step in (1, 2):
+                waiting = asyncio.ensure_future(stream.observe(frames[step], np.full(dimension, 0.1 * step)))
+                await asyncio.sleep(0.01 * step)
+                waiting.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await waiting
+                belief = await stream.observe(frames[step], np.full(dimension, 0.1 * step))
+                assert belief.step == step
+            assert (await s.refresh()).next_step == 3
+
+    asyncio.run(run())
+
+
 def test_streams_of_asyncio_run_side_by_side(address, frames, dimension):
     async def loop(client):
         async with await client.create_session() as s, s.stream(outputs=["latents"]) as stream:
