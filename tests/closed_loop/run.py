@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -65,6 +66,8 @@ def main(arguments: list[str] | None = None) -> None:
     parse.add_argument("--iterations", type=int, default=Budget.iterations)
     parse.add_argument("--decisions", type=int, default=DECISIONS, help="most of an episode")
     given = parse.parse_args(arguments)
+    # Whoever is told to end takes the programs it started along.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended; run it again to go on"))
     budget = Budget(given.horizon, given.candidates, given.iterations)
     program = os.environ.get("GATSBI_SIM", str(ROOT / "target/debug/gatsbi-sim"))
     with ExitStack() as stack:
