@@ -1,6 +1,7 @@
 """Generates `gatsbi_client/_proto` from the proto files, and the blocking client from the asyncio one.
 
-Run it after changing either: `python generate.py`.
+Run it after changing either: `python generate.py`. Generated messages run on the protobuf of their generator's major
+version and on the next one, so the generator is an old one: grpcio-tools 1.76.0 makes what runs from 6.31.1 on.
 """
 
 from __future__ import annotations
@@ -42,8 +43,12 @@ def blocking(asyncio_client: str) -> str:
     text = asyncio_client
     for awaited, plain in [
         ("The asyncio client. `generate.py` makes the blocking one of it.", "The blocking client, made by `generate.py`."),
-        ("import asyncio\n", ""),
+        ("import asyncio\n", "import queue\n"),
         ("asyncio.sleep", "time.sleep"),
+        ("asyncio.Queue", "queue.Queue"),
+        ("aiter(", "iter("),
+        ("anext(", "next("),
+        ("StopAsyncIteration", "StopIteration"),
         # Stubs demand the grace period, which the blocking channel does not know.
         (".close(None)", ".close()"),
         ("grpc.aio.", "grpc."),

@@ -32,6 +32,32 @@ pub trait Environment {
     /// Sets the goal and returns the frame as it would look with the objects there and all else as it is. From then
     /// on states tell the distance.
     fn set_goal(&mut self, goal: &Goal) -> Result<Observation>;
+
+    /// What would come of other actions: the objects after each action of each candidate. The scene itself stays as
+    /// it is, so a planner can search in the truth instead of a model of it.
+    ///
+    /// # Errors
+    /// [`crate::Error::NobodyActs`], and those of [`Environment::step`].
+    fn futures(&mut self, candidates: &[Vec<Vec<f32>>]) -> Result<Vec<Vec<Vec<ObjectState>>>>;
+
+    /// The actions that move the hand over the table, as the robot's own controller knows them: candidates of
+    /// displacements along the world's x and y in metres, one a frame. Nothing that is in the way is considered, and
+    /// the hand stays on the tray.
+    ///
+    /// # Errors
+    /// [`crate::Error::NobodyActs`].
+    fn hand_moves(&mut self, candidates: &[Vec<[f64; 2]>]) -> Result<Vec<Vec<HandMove>>>;
+}
+
+/// An action that moves the hand.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct HandMove {
+    /// The action.
+    pub action: Vec<f32>,
+    /// The point between the fingertips after it, metres.
+    pub position: [f64; 3],
+    /// That point in the picture, as in [`ObjectState::pixel`].
+    pub pixel: [f64; 2],
 }
 
 /// Where objects shall be.

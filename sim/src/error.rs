@@ -54,8 +54,8 @@ pub enum Error {
         /// Largest.
         high: f32,
     },
-    /// A goal in a scene where nobody acts.
-    #[error("nobody acts in {scene}, so it takes no goal")]
+    /// A goal or candidates of actions in a scene where nobody acts.
+    #[error("nobody acts in {scene}, so it takes neither goals nor candidates")]
     NobodyActs {
         /// The scene.
         scene: &'static str,

@@ -41,7 +41,7 @@ mod scene;
 mod seeds;
 
 pub use environment::{
-    AGENT, BACKGROUND, Environment, FIRST_OBJECT, Goal, ObjectState, Observation, State,
+    AGENT, BACKGROUND, Environment, FIRST_OBJECT, Goal, HandMove, ObjectState, Observation, State,
 };
 pub use error::{Error, Result};
 pub use scene::{ActionSpec, Scene, SceneSpec};

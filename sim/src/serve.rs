@@ -9,6 +9,8 @@
 //! | `{"op": "step", "action": [0.1, ...]}` | observation |
 //! | `{"op": "set_goal", "objects": [[0.5, 0.1], null, ...]}` | observation: how it would look |
 //! | `{"op": "scripted_action"}` | `{"action": [...]}` |
+//! | `{"op": "futures", "candidates": [[[0.1, ...], ...], ...]}` | `{"futures": [...]}`: objects by candidate and action |
+//! | `{"op": "hand_moves", "candidates": [[[0.02, 0.0], ...], ...]}` | `{"moves": [...]}`: actions and hands, likewise |
 //!
 //! An observation is `{"state": {...}, "rgb": [H, W, 3], "mask": [H, W]}` with the [`crate::State`], a line feed, and then
 //! as many bytes as the shapes say: the frame, then the labels. A request that cannot be fulfilled is answered with
@@ -22,7 +24,7 @@ use std::{
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::{Environment, Error, Goal, Observation};
+use crate::{Environment, Error, Goal, HandMove, ObjectState, Observation};
 
 /// Raised when a program that knows the one before would not understand.
 pub const PROTOCOL: u32 = 1;
@@ -34,11 +36,15 @@ enum Request {
     Step { action: Vec<f32> },
     SetGoal(Goal),
     ScriptedAction,
+    Futures { candidates: Vec<Vec<Vec<f32>>> },
+    HandMoves { candidates: Vec<Vec<[f64; 2]>> },
 }
 
 enum Answer {
     Seen(Box<Observation>),
     Action(Vec<f32>),
+    Futures(Vec<Vec<Vec<ObjectState>>>),
+    Moves(Vec<Vec<HandMove>>),
 }
 
 /// Answers requests until the input ends.
@@ -64,6 +70,8 @@ pub fn serve(
                 line_and(&mut output, &seen, &[&rgb, &mask])?;
             }
             Ok(Answer::Action(action)) => line(&mut output, &json!({ "action": action }))?,
+            Ok(Answer::Futures(futures)) => line(&mut output, &json!({ "futures": futures }))?,
+            Ok(Answer::Moves(moves)) => line(&mut output, &json!({ "moves": moves }))?,
             Err(error) => line(&mut output, &json!({ "error": error }))?,
         }
     }
@@ -76,6 +84,8 @@ fn answer(scene: &mut dyn Environment, request: Request) -> Result<Answer, Error
         Request::Step { action } => scene.step(&action).map(seen),
         Request::SetGoal(goal) => scene.set_goal(&goal).map(seen),
         Request::ScriptedAction => scene.scripted_action().map(Answer::Action),
+        Request::Futures { candidates } => scene.futures(&candidates).map(Answer::Futures),
+        Request::HandMoves { candidates } => scene.hand_moves(&candidates).map(Answer::Moves),
     }
 }
 

@@ -93,5 +93,5 @@ fn python_acts_in_a_scene() {
         .output()
         .unwrap();
     let said = text(&output.stderr);
-    assert!(output.status.success() && said.contains("Ran 4 tests"), "{said}");
+    assert!(output.status.success() && said.contains("Ran 5 tests"), "{said}");
 }

@@ -2,7 +2,9 @@
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
-use gatsbi_sim::{AGENT, BACKGROUND, Environment, Error, FIRST_OBJECT, Goal, Observation, Scene};
+use gatsbi_sim::{
+    AGENT, BACKGROUND, Environment, Error, FIRST_OBJECT, Goal, HandMove, Observation, Scene,
+};
 
 /// Plays `steps` steps of the script.
 fn play(scene: &mut dyn Environment, seed: u64, steps: usize) -> Vec<(Observation, Vec<f32>)> {
@@ -195,4 +197,33 @@ fn what_is_refused_changes_nothing() {
     let after = scene.step(&[0.0; 7]).unwrap();
     assert_eq!((after.state.step, after.state.goal_distance), (1, None));
     assert!(matches!(Scene::Roll.open(8), Err(Error::Size { found: 8 })));
+}
+
+#[test]
+fn futures_come_true_and_nothing_has_moved() {
+    for name in [Scene::Push1, Scene::Push2] {
+        let mut scene = name.open(16).unwrap();
+        play(scene.as_mut(), 5, 6);
+        let moves = scene.hand_moves(&[vec![[0.03, 0.0]; 3], vec![[0.0, -0.03]; 3]]).unwrap();
+        let actions = |way: &Vec<HandMove>| way.iter().map(|step| step.action.clone()).collect();
+        let candidates: Vec<Vec<Vec<f32>>> = moves.iter().map(actions).collect();
+        let futures = scene.futures(&candidates).unwrap();
+        assert_eq!(futures, scene.futures(&candidates).unwrap());
+        assert_ne!(futures[0], futures[1]);
+        for (step, action) in candidates[1].iter().enumerate() {
+            let seen = scene.step(action).unwrap();
+            assert_eq!(seen.state.objects, futures[1][step], "{name} {step}");
+            // The gripper of push2 follows its target, later.
+            let off = distance(&hand(&seen)[..3], &moves[1][step].position);
+            assert!(name == Scene::Push2 || off < 0.015, "{name} {step}: the hand is {off} m off");
+        }
+        let short = scene.futures(&[vec![vec![0.0]]]);
+        assert!(matches!(short, Err(Error::ActionLength { found: 1, .. })));
+    }
+    let mut nobody = Scene::Balls3.open(16).unwrap();
+    nobody.reset(1).unwrap();
+    assert!(matches!(nobody.futures(&[]), Err(Error::NobodyActs { .. })));
+    assert!(matches!(nobody.hand_moves(&[]), Err(Error::NobodyActs { .. })));
+    let mut early = Scene::Push1.open(16).unwrap();
+    assert!(matches!(early.futures(&[]), Err(Error::NotReset)));
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from types import TracebackType
-from typing import AsyncIterator, Callable, Iterable, Mapping, Sequence, TypeVar
+from typing import AsyncIterable, AsyncIterator, Callable, Iterable, Mapping, Sequence, TypeVar, cast
 
 import grpc
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._core import Image, Retries
 from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
+from gatsbi_client._proto.gatsbi.v1.session_service_pb2 import ObserveStreamRequest, ObserveStreamResponse
 from gatsbi_client.costs import CostProgram
 
 T = TypeVar("T")
@@ -97,6 +98,16 @@ class AsyncClient:
         """A session that is open already."""
         return AsyncSession(self, await self._call(core.get(session_id)))
 
+    async def sessions(self, *, label: str = "") -> tuple[t.SessionInfo, ...]:
+        """All sessions that this client may see, sorted by id; with a label, those that bear it."""
+        found: list[t.SessionInfo] = []
+        page = ""
+        while True:
+            more, page = await self._call(core.list_sessions(label, page))
+            found += more
+            if not page:
+                return tuple(found)
+
     async def import_session(self, snapshot: bytes, *, label: str = "", keep_steps: int = 0) -> AsyncSession:
         """A new session from the bytes of `AsyncSession.export`."""
         return AsyncSession(self, await self._call(core.restore(snapshot, "", label, keep_steps)))
@@ -148,7 +159,10 @@ class AsyncClient:
 
 
 class AsyncSession:
-    """One robot's belief. As a context manager it deletes the session at the end."""
+    """One robot's belief. As a context manager it deletes the session at the end.
+
+    `at_step` makes a call fail with `Conflict` if the session's last step is another one.
+    """
 
     def __init__(self, client: AsyncClient, info: t.SessionInfo) -> None:
         self._client = client
@@ -193,36 +207,46 @@ class AsyncSession:
         self._next = max(self._next, belief.step + 1)
         return belief
 
+    def stream(
+        self, *, outputs: Sequence[t.OutputName] = ("objects",), encoding: t.EncodingName = "f32"
+    ) -> AsyncStream:
+        """A control loop on one connection, to be used as a context manager."""
+        return AsyncStream(self, outputs, encoding)
+
     async def imagine(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        at_step: int | None = None,
     ) -> t.Rollout:
         """Rolls actions out, raw units `[N, H, A]` or `[H, A]`. Without `samples`, means are taken."""
         return await self._client._gather(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, at_step
         ))
 
     def imagine_chunks(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        at_step: int | None = None,
     ) -> AsyncIterator[t.Chunk]:
         """As `imagine`, chunk by chunk as they arrive; not tried again by itself."""
         return self._client._chunks(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, at_step
         ), self._client._timeout)
 
     async def score(
         self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        by_sample: bool = False, by_term: bool = False,
+        by_sample: bool = False, by_term: bool = False, at_step: int | None = None,
     ) -> t.Scores:
         """Costs of candidates `[N, H, A]`, raw units. Without `samples`, means are taken."""
-        return await self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
+        return await self._client._call(core.score(
+            self.id, actions, costs, samples, seed, by_sample, by_term, at_step
+        ))
 
     async def plan(
         self, horizon: int, costs: CostProgram, *, optimiser: t.Optimiser | None = None, samples: int | None = None,
         seed: int | None = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
         action_repeat: int = 1, warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
-        outputs: Sequence[t.OutputName] = (), encoding: t.EncodingName = "f32",
+        outputs: Sequence[t.OutputName] = (), encoding: t.EncodingName = "f32", at_step: int | None = None,
     ) -> t.Plan:
         """The best actions that `optimiser` (iCEM by default) finds within `budget` seconds.
 
@@ -231,21 +255,23 @@ class AsyncSession:
         """
         return await self._client._call(core.plan(
             self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget,
-            action_repeat, outputs, encoding,
+            action_repeat, outputs, encoding, at_step,
         ))
 
-    async def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[AsyncSession, ...]:
+    async def fork(
+        self, count: int = 1, *, label: str | None = None, seed: int | None = None, at_step: int | None = None
+    ) -> tuple[AsyncSession, ...]:
         """New sessions with this one's belief."""
-        infos = await self._client._call(core.fork(self.id, count, label, seed))
+        infos = await self._client._call(core.fork(self.id, count, label, seed, at_step))
         return tuple(AsyncSession(self._client, info) for info in infos)
 
     async def rewind(self, to_step: int) -> t.SessionInfo:
         """Makes a kept step the last one observed."""
         return self._take(await self._client._call(core.rewind(self.id, to_step)))
 
-    async def export(self) -> bytes:
+    async def export(self, *, at_step: int | None = None) -> bytes:
         """The belief as bytes."""
-        return await self._client._call(core.export(self.id))
+        return await self._client._call(core.export(self.id, at_step))
 
     async def restore(self, snapshot: bytes) -> t.SessionInfo:
         """Replaces this session's belief by an exported one."""
@@ -254,6 +280,82 @@ class AsyncSession:
     async def delete(self) -> None:
         """Closes the session."""
         await self._client._call(core.delete(self.id))
+
+
+class AsyncStream:
+    """Observations over one connection, an answer each. One that fails raises and does not end the stream.
+
+    A connection that is lost is opened again, and the observation sent again: its number makes that safe.
+    """
+
+    def __init__(self, session: AsyncSession, outputs: Sequence[t.OutputName], encoding: t.EncodingName) -> None:
+        self._session, self._outputs, self._encoding = session, outputs, encoding
+        self._requests: asyncio.Queue[ObserveStreamRequest | None] = asyncio.Queue()
+        self._answers: AsyncIterator[ObserveStreamResponse] | None = None
+
+    async def __aenter__(self) -> AsyncStream:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def observe(
+        self, image: Image | None, action: npt.ArrayLike | None = None, *, step: int | None = None
+    ) -> t.Belief:
+        """As `AsyncSession.observe`."""
+        session, client = self._session, self._session._client
+        call = core.observe_streamed(
+            session.id, session._next if step is None else step, image, action, self._outputs, self._encoding,
+            client._timeout,
+        )
+        end, attempt = time.monotonic() + client._timeout, 0
+        while True:
+            attempt += 1
+            try:
+                belief = await self._exchange(call)
+                session._next = max(session._next, belief.step + 1)
+                return belief
+            except errors.GatsbiError as error:
+                wait = client._retries.wait(attempt, error, call.repeatable)
+                if wait is None or time.monotonic() + wait >= end:
+                    raise
+            await asyncio.sleep(wait)
+
+    async def _exchange(self, call: core.Call[t.Belief]) -> t.Belief:
+        answers = self._answers or aiter(self._open(call))
+        # Who breaks off the wait leaves an answer behind: unless it has come, the next one opens another stream.
+        self._answers = None
+        await self._requests.put(call.request)
+        try:
+            answer = await anext(answers)
+        except grpc.RpcError as failed:
+            await self.close()
+            raise core.translate(failed) from failed
+        except StopAsyncIteration as ended:
+            await self.close()
+            raise errors.Unavailable("the server ended the stream", code=grpc.StatusCode.UNAVAILABLE) from ended
+        self._answers = answers
+        return call.parse(answer)
+
+    def _open(self, call: core.Call[t.Belief]) -> AsyncIterable[ObserveStreamResponse]:
+        self._requests.put_nowait(None)
+        self._requests = asyncio.Queue()
+        invoke = self._session._client._channel.stream_stream(
+            f"/gatsbi.v1.{call.method}", ObserveStreamRequest.SerializeToString, call.answer.FromString
+        )
+        return cast("AsyncIterable[ObserveStreamResponse]", invoke(_until_none(self._requests)))
+
+    async def close(self) -> None:
+        """Ends the stream; the session stays. Another observation opens it again."""
+        await self._requests.put(None)
+        self._answers = None
+
+
+async def _until_none(requests: asyncio.Queue[ObserveStreamRequest | None]) -> AsyncIterator[ObserveStreamRequest]:
+    while (request := await requests.get()) is not None:
+        yield request
 
 
 class AsyncHandles:

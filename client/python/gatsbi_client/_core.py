@@ -32,6 +32,9 @@ CHANNEL_OPTIONS: list[tuple[str, int]] = [
     ("grpc.max_send_message_length", -1),
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2000),
+    # A connection that is gone without a word is noticed, also between two answers of a stream.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
 ]
 
 
@@ -216,6 +219,11 @@ def get(session: str) -> Call[t.SessionInfo]:
                 lambda r: _session(r.session), True)
 
 
+def list_sessions(label: str, page: str) -> Call[tuple[tuple[t.SessionInfo, ...], str]]:
+    return Call("SessionService/ListSessions", se.ListSessionsRequest(label=label, page_token=page),
+                se.ListSessionsResponse, lambda r: (tuple(_session(s) for s in r.sessions), r.next_page_token), True)
+
+
 def delete(session: str) -> Call[None]:
     return Call("SessionService/DeleteSession", se.DeleteSessionRequest(session_id=session),
                 se.DeleteSessionResponse, lambda r: None, False)
@@ -225,18 +233,42 @@ def observe(
     session: str, step: int, image: Image | None, action: npt.ArrayLike | None,
     outputs: Iterable[t.OutputName], encoding: t.EncodingName,
 ) -> Call[t.Belief]:
-    observation = step_pb2.Observation(
-        step=step,
-        image=None if image is None else picture(image),
-        action=[] if action is None else np.asarray(action, dtype=np.float32).reshape(-1).tolist(),
+    request = se.ObserveRequest(
+        session_id=session, observation=_observation(step, image, action), outputs=selection(outputs, encoding)
     )
-    request = se.ObserveRequest(session_id=session, observation=observation, outputs=selection(outputs, encoding))
     # Repeating an observation with the same number gets the stored answer.
     return Call("SessionService/Observe", request, se.ObserveResponse, lambda r: _belief(r.belief), True)
 
 
-def fork(session: str, count: int, label: str | None, seed: int | None) -> Call[tuple[t.SessionInfo, ...]]:
-    request = se.ForkSessionRequest(session_id=session, count=count, label=label, seed=seed)
+def observe_streamed(
+    session: str, step: int, image: Image | None, action: npt.ArrayLike | None,
+    outputs: Iterable[t.OutputName], encoding: t.EncodingName, timeout: float,
+) -> Call[t.Belief]:
+    request = se.ObserveStreamRequest(
+        session_id=session, observation=_observation(step, image, action), outputs=selection(outputs, encoding),
+        timeout_millis=max(1, round(timeout * 1e3)),
+    )
+
+    def parse(answer: se.ObserveStreamResponse) -> t.Belief:
+        if answer.HasField("problem"):
+            raise errors.from_problem(answer.problem)
+        return _belief(answer.belief)
+
+    return Call("SessionService/ObserveStream", request, se.ObserveStreamResponse, parse, True)
+
+
+def _observation(step: int, image: Image | None, action: npt.ArrayLike | None) -> step_pb2.Observation:
+    return step_pb2.Observation(
+        step=step,
+        image=None if image is None else picture(image),
+        action=[] if action is None else np.asarray(action, dtype=np.float32).reshape(-1).tolist(),
+    )
+
+
+def fork(
+    session: str, count: int, label: str | None, seed: int | None, at_step: int | None
+) -> Call[tuple[t.SessionInfo, ...]]:
+    request = se.ForkSessionRequest(session_id=session, count=count, label=label, seed=seed, at_step=at_step)
     return Call("SessionService/ForkSession", request, se.ForkSessionResponse,
                 lambda r: tuple(_session(s) for s in r.sessions), False)
 
@@ -247,8 +279,8 @@ def rewind(session: str, to_step: int) -> Call[t.SessionInfo]:
                 lambda r: _session(r.session), False)
 
 
-def export(session: str) -> Call[bytes]:
-    return Call("SessionService/ExportSession", se.ExportSessionRequest(session_id=session),
+def export(session: str, at_step: int | None) -> Call[bytes]:
+    return Call("SessionService/ExportSession", se.ExportSessionRequest(session_id=session, at_step=at_step),
                 se.ExportSessionResponse, lambda r: bytes(r.snapshot), True)
 
 
@@ -260,10 +292,10 @@ def restore(snapshot: bytes, session: str, label: str, keep_steps: int) -> Call[
 
 def imagine(
     session: str, actions: npt.ArrayLike, outputs: Iterable[t.OutputName], encoding: t.EncodingName,
-    samples: int | None, seed: int | None, every_k: int | None, last_only: bool,
+    samples: int | None, seed: int | None, every_k: int | None, last_only: bool, at_step: int | None,
 ) -> Call[t.Chunk]:
     request = im.ImagineRequest(
-        session_id=session, actions=floats(actions), sampling=sampling(samples, seed),
+        session_id=session, at_step=at_step, actions=floats(actions), sampling=sampling(samples, seed),
         outputs=selection(outputs, encoding, every_k, last_only),
     )
     return Call("ImaginationService/Imagine", request, im.ImagineResponse, lambda r: _chunk(r.chunk), True)
@@ -278,7 +310,7 @@ def predictions(
     def messages() -> Iterator[im.PredictBatchRequest]:
         for each in requests:
             yield im.PredictBatchRequest(
-                key=each.key, start=_start(each.start), actions=floats(each.actions),
+                key=each.key, start=_start(each.start, each.at_step), actions=floats(each.actions),
                 sampling=sampling(each.samples, each.seed), outputs=chosen,
             )
 
@@ -290,10 +322,10 @@ def predictions(
     return Call("ImaginationService/PredictBatch", messages(), im.PredictBatchResponse, parse, False)
 
 
-def _start(start: str | bytes) -> im.Start:
+def _start(start: str | bytes, at_step: int | None = None) -> im.Start:
     if isinstance(start, bytes):
         return im.Start(snapshot=start)
-    return im.Start(session=im.SessionStart(session_id=start))
+    return im.Start(session=im.SessionStart(session_id=start, at_step=at_step))
 
 
 def open_handles(starts: Iterable[str | bytes], samples: int | None, seed: int | None) -> Call[t.HandlesInfo]:
@@ -321,10 +353,10 @@ def close_handles(handles: str) -> Call[None]:
 
 def score(
     session: str, actions: npt.ArrayLike, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
-    by_sample: bool, by_term: bool,
+    by_sample: bool, by_term: bool, at_step: int | None,
 ) -> Call[t.Scores]:
     request = pl.ScoreRequest(
-        session_id=session, actions=floats(actions), sampling=sampling(samples, seed), costs=costs,
+        session_id=session, at_step=at_step, actions=floats(actions), sampling=sampling(samples, seed), costs=costs,
         by_sample=by_sample, by_term=by_term,
     )
 
@@ -342,7 +374,7 @@ def plan(
     session: str, horizon: int, costs: cost_pb2.CostProgram, samples: int | None, seed: int | None,
     optimiser: t.Optimiser | None, action_min: Sequence[float],
     action_max: Sequence[float], warm_start: npt.ArrayLike | bool, budget: float | None,
-    action_repeat: int, outputs: Sequence[t.OutputName], encoding: t.EncodingName,
+    action_repeat: int, outputs: Sequence[t.OutputName], encoding: t.EncodingName, at_step: int | None,
 ) -> Call[t.Plan]:
     # A seed without samples drives the optimiser alone.
     drawn = step_pb2.Sampling(mode=step_pb2.MODE_MEAN, seed=seed) if samples is None else sampling(samples, seed)
@@ -359,7 +391,7 @@ def plan(
     if outputs:
         fields["outputs"] = selection(outputs, encoding)
     request = pl.PlanRequest(
-        session_id=session, horizon=horizon, costs=costs, sampling=drawn,
+        session_id=session, at_step=at_step, horizon=horizon, costs=costs, sampling=drawn,
         action_min=action_min, action_max=action_max, action_repeat=action_repeat, **fields,
     )
 

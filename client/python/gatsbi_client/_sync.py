@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 import time
 from types import TracebackType
-from typing import Iterator, Callable, Iterable, Mapping, Sequence, TypeVar
+from typing import Iterable, Iterator, Callable, Iterable, Mapping, Sequence, TypeVar, cast
 
 import grpc
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from gatsbi_client import errors
 from gatsbi_client import types as t
 from gatsbi_client._core import Image, Retries
 from gatsbi_client._proto.gatsbi.v1.imagination_service_pb2 import PredictBatchRequest
+from gatsbi_client._proto.gatsbi.v1.session_service_pb2 import ObserveStreamRequest, ObserveStreamResponse
 from gatsbi_client.costs import CostProgram
 
 T = TypeVar("T")
@@ -96,6 +98,16 @@ class Client:
         """A session that is open already."""
         return Session(self, self._call(core.get(session_id)))
 
+    def sessions(self, *, label: str = "") -> tuple[t.SessionInfo, ...]:
+        """All sessions that this client may see, sorted by id; with a label, those that bear it."""
+        found: list[t.SessionInfo] = []
+        page = ""
+        while True:
+            more, page = self._call(core.list_sessions(label, page))
+            found += more
+            if not page:
+                return tuple(found)
+
     def import_session(self, snapshot: bytes, *, label: str = "", keep_steps: int = 0) -> Session:
         """A new session from the bytes of `Session.export`."""
         return Session(self, self._call(core.restore(snapshot, "", label, keep_steps)))
@@ -147,7 +159,10 @@ class Client:
 
 
 class Session:
-    """One robot's belief. As a context manager it deletes the session at the end."""
+    """One robot's belief. As a context manager it deletes the session at the end.
+
+    `at_step` makes a call fail with `Conflict` if the session's last step is another one.
+    """
 
     def __init__(self, client: Client, info: t.SessionInfo) -> None:
         self._client = client
@@ -192,36 +207,46 @@ class Session:
         self._next = max(self._next, belief.step + 1)
         return belief
 
+    def stream(
+        self, *, outputs: Sequence[t.OutputName] = ("objects",), encoding: t.EncodingName = "f32"
+    ) -> Stream:
+        """A control loop on one connection, to be used as a context manager."""
+        return Stream(self, outputs, encoding)
+
     def imagine(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        at_step: int | None = None,
     ) -> t.Rollout:
         """Rolls actions out, raw units `[N, H, A]` or `[H, A]`. Without `samples`, means are taken."""
         return self._client._gather(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, at_step
         ))
 
     def imagine_chunks(
         self, actions: npt.ArrayLike, *, outputs: Sequence[t.OutputName], encoding: t.EncodingName = "f32",
         samples: int | None = None, seed: int | None = None, every_k: int | None = None, last_only: bool = False,
+        at_step: int | None = None,
     ) -> Iterator[t.Chunk]:
         """As `imagine`, chunk by chunk as they arrive; not tried again by itself."""
         return self._client._chunks(core.imagine(
-            self.id, actions, outputs, encoding, samples, seed, every_k, last_only
+            self.id, actions, outputs, encoding, samples, seed, every_k, last_only, at_step
         ), self._client._timeout)
 
     def score(
         self, actions: npt.ArrayLike, costs: CostProgram, *, samples: int | None = None, seed: int | None = None,
-        by_sample: bool = False, by_term: bool = False,
+        by_sample: bool = False, by_term: bool = False, at_step: int | None = None,
     ) -> t.Scores:
         """Costs of candidates `[N, H, A]`, raw units. Without `samples`, means are taken."""
-        return self._client._call(core.score(self.id, actions, costs, samples, seed, by_sample, by_term))
+        return self._client._call(core.score(
+            self.id, actions, costs, samples, seed, by_sample, by_term, at_step
+        ))
 
     def plan(
         self, horizon: int, costs: CostProgram, *, optimiser: t.Optimiser | None = None, samples: int | None = None,
         seed: int | None = None, action_min: Sequence[float] = (), action_max: Sequence[float] = (),
         action_repeat: int = 1, warm_start: npt.ArrayLike | bool = False, budget: float | None = None,
-        outputs: Sequence[t.OutputName] = (), encoding: t.EncodingName = "f32",
+        outputs: Sequence[t.OutputName] = (), encoding: t.EncodingName = "f32", at_step: int | None = None,
     ) -> t.Plan:
         """The best actions that `optimiser` (iCEM by default) finds within `budget` seconds.
 
@@ -230,21 +255,23 @@ class Session:
         """
         return self._client._call(core.plan(
             self.id, horizon, costs, samples, seed, optimiser, action_min, action_max, warm_start, budget,
-            action_repeat, outputs, encoding,
+            action_repeat, outputs, encoding, at_step,
         ))
 
-    def fork(self, count: int = 1, *, label: str | None = None, seed: int | None = None) -> tuple[Session, ...]:
+    def fork(
+        self, count: int = 1, *, label: str | None = None, seed: int | None = None, at_step: int | None = None
+    ) -> tuple[Session, ...]:
         """New sessions with this one's belief."""
-        infos = self._client._call(core.fork(self.id, count, label, seed))
+        infos = self._client._call(core.fork(self.id, count, label, seed, at_step))
         return tuple(Session(self._client, info) for info in infos)
 
     def rewind(self, to_step: int) -> t.SessionInfo:
         """Makes a kept step the last one observed."""
         return self._take(self._client._call(core.rewind(self.id, to_step)))
 
-    def export(self) -> bytes:
+    def export(self, *, at_step: int | None = None) -> bytes:
         """The belief as bytes."""
-        return self._client._call(core.export(self.id))
+        return self._client._call(core.export(self.id, at_step))
 
     def restore(self, snapshot: bytes) -> t.SessionInfo:
         """Replaces this session's belief by an exported one."""
@@ -253,6 +280,82 @@ class Session:
     def delete(self) -> None:
         """Closes the session."""
         self._client._call(core.delete(self.id))
+
+
+class Stream:
+    """Observations over one connection, an answer each. One that fails raises and does not end the stream.
+
+    A connection that is lost is opened again, and the observation sent again: its number makes that safe.
+    """
+
+    def __init__(self, session: Session, outputs: Sequence[t.OutputName], encoding: t.EncodingName) -> None:
+        self._session, self._outputs, self._encoding = session, outputs, encoding
+        self._requests: queue.Queue[ObserveStreamRequest | None] = queue.Queue()
+        self._answers: Iterator[ObserveStreamResponse] | None = None
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def observe(
+        self, image: Image | None, action: npt.ArrayLike | None = None, *, step: int | None = None
+    ) -> t.Belief:
+        """As `Session.observe`."""
+        session, client = self._session, self._session._client
+        call = core.observe_streamed(
+            session.id, session._next if step is None else step, image, action, self._outputs, self._encoding,
+            client._timeout,
+        )
+        end, attempt = time.monotonic() + client._timeout, 0
+        while True:
+            attempt += 1
+            try:
+                belief = self._exchange(call)
+                session._next = max(session._next, belief.step + 1)
+                return belief
+            except errors.GatsbiError as error:
+                wait = client._retries.wait(attempt, error, call.repeatable)
+                if wait is None or time.monotonic() + wait >= end:
+                    raise
+            time.sleep(wait)
+
+    def _exchange(self, call: core.Call[t.Belief]) -> t.Belief:
+        answers = self._answers or iter(self._open(call))
+        # Who breaks off the wait leaves an answer behind: unless it has come, the next one opens another stream.
+        self._answers = None
+        self._requests.put(call.request)
+        try:
+            answer = next(answers)
+        except grpc.RpcError as failed:
+            self.close()
+            raise core.translate(failed) from failed
+        except StopIteration as ended:
+            self.close()
+            raise errors.Unavailable("the server ended the stream", code=grpc.StatusCode.UNAVAILABLE) from ended
+        self._answers = answers
+        return call.parse(answer)
+
+    def _open(self, call: core.Call[t.Belief]) -> Iterable[ObserveStreamResponse]:
+        self._requests.put_nowait(None)
+        self._requests = queue.Queue()
+        invoke = self._session._client._channel.stream_stream(
+            f"/gatsbi.v1.{call.method}", ObserveStreamRequest.SerializeToString, call.answer.FromString
+        )
+        return cast("Iterable[ObserveStreamResponse]", invoke(_until_none(self._requests)))
+
+    def close(self) -> None:
+        """Ends the stream; the session stays. Another observation opens it again."""
+        self._requests.put(None)
+        self._answers = None
+
+
+def _until_none(requests: queue.Queue[ObserveStreamRequest | None]) -> Iterator[ObserveStreamRequest]:
+    while (request := requests.get()) is not None:
+        yield request
 
 
 class Handles:

@@ -141,6 +141,8 @@ def from_problem(problem: problem_pb2.Problem) -> GatsbiError:
         FieldProblem(each.field, f"is {each.value}, expected {each.expected}") for each in problem.fields
     )
     retry_after = problem.retry_after_millis / 1e3 if problem.HasField("retry_after_millis") else None
+    # Streams have no metadata; what a gap expects is said by its field.
+    metadata = {"expected_step": problem.fields[0].expected} if problem.reason == "STEP_GAP" else {}
     return _class(code, problem.reason)(
-        problem.message, code=code, reason=problem.reason, fields=fields, retry_after=retry_after
+        problem.message, code=code, reason=problem.reason, fields=fields, retry_after=retry_after, metadata=metadata
     )

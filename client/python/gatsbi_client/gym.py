@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Callable
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -11,20 +11,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from gatsbi_client._sync import Client
+from gatsbi_client.rewards import Reward, action_bounds, neutral_action, object_to_target, visible
 
-Reward = Callable[[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]], npt.NDArray[Any]]
-"""From object ids `[rows, MAX]`, objects `[rows, MAX, 6]` and actions `[rows, A]` to rewards `[rows]`."""
-
-
-def object_to_target(object_id: int, x: float, y: float) -> Reward:
-    """Minus the distance of an object to a point in [-1, 1]; -2 where the object is not present."""
-
-    def reward(ids: npt.NDArray[Any], objects: npt.NDArray[Any], _: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        here = (ids == object_id) & (objects[..., 0] >= 0.5)
-        distance = np.hypot(objects[..., 1] - x, objects[..., 2] - y)
-        return np.asarray(-np.where(here, distance, 2.0).min(axis=1))
-
-    return reward
+__all__ = ["ImaginedVectorEnv", "Reward", "object_to_target"]
 
 
 class ImaginedVectorEnv(VectorEnv[Any, Any, Any]):
@@ -44,18 +33,14 @@ class ImaginedVectorEnv(VectorEnv[Any, Any, Any]):
         model = next(each for each in client.models() if each.name == info.model)
         self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
         self.num_envs = num_envs
-        offset = np.array([each.offset for each in model.actions])
-        reach = 2 * np.abs([each.scale for each in model.actions])
-        self.single_action_space = gymnasium.spaces.Box(
-            (offset - reach).astype(np.float32), (offset + reach).astype(np.float32), dtype=np.float32
-        )
+        self.single_action_space = gymnasium.spaces.Box(*action_bounds(model), dtype=np.float32)
         self.single_observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (model.max_objects, 6), dtype=np.float32
         )
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._client, self._start, self._samples = client, session_id, samples
-        self._neutral = offset.astype(np.float32)
+        self._neutral = neutral_action(model)
         self._reward, self._horizon = reward, horizon
         self._handles: Any = None
         self._ages = np.zeros(num_envs, dtype=np.int64)
@@ -72,7 +57,7 @@ class ImaginedVectorEnv(VectorEnv[Any, Any, Any]):
         )
         self._ages[:] = 0
         answer = self._handles.step(np.tile(self._neutral, (self.num_envs, 1)))
-        return self._seen(answer.outputs), {"object_ids": answer.outputs["object_ids"]}
+        return visible(answer.outputs), {"object_ids": answer.outputs["object_ids"]}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Steps all rows by actions `[num_envs, A]`, raw units."""
@@ -86,10 +71,7 @@ class ImaginedVectorEnv(VectorEnv[Any, Any, Any]):
         rewards = np.where(ended, 0.0, self._reward(outputs["object_ids"], outputs["objects"], taken))
         truncated = self._ages >= self._horizon
         nothing = np.zeros(self.num_envs, dtype=np.bool_)
-        return self._seen(outputs), rewards, nothing, truncated, {"object_ids": outputs["object_ids"]}
-
-    def _seen(self, outputs: Any) -> npt.NDArray[Any]:
-        return np.where(outputs["object_ids"][..., None] >= 0, outputs["objects"], 0).astype(np.float32)
+        return visible(outputs), rewards, nothing, truncated, {"object_ids": outputs["object_ids"]}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Gives the rows back."""

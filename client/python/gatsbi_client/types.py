@@ -155,6 +155,10 @@ class Scores:
     """`[N, terms]` before weighting, if asked for."""
     best: int
 
+    def total(self, per_violation: float = 1e3) -> Floats:
+        """Costs `[N]` for searches that know no constraints: what violates them pays for it."""
+        return self.costs if self.violations is None else self.costs + per_violation * self.violations
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -221,6 +225,8 @@ class Prediction:
     """Raw units, `[N, H, A]` or `[H, A]`."""
     samples: int | None = None
     seed: int | None = None
+    at_step: int | None = None
+    """Fails if the session's last step is another one."""
 
 
 @dataclass(frozen=True)

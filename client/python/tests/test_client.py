@@ -1,7 +1,5 @@
 import asyncio
 import re
-import socket
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,8 @@ def test_generated_files_are_current(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("snippet", re.findall(r"```python\n(.*?)```", (HERE / "README.md").read_text(), re.S))
-def test_readme(snippet, address, frames):
+def test_readme(snippet, address, frames, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     exec(snippet, {"address": address, "frames": frames})
 
 
@@ -131,46 +130,59 @@ def test_errors(client, frames, dimension):
         client.session("0" * 32)
 
 
-def test_lost_answer_is_asked_for_again(address, frames):
-    host, port = address.split(":")
-    armed, cuts = threading.Event(), []
-    listener = socket.create_server(("127.0.0.1", 0))
-
-    def pump(a, b, back):
-        try:
-            while data := a.recv(65536):
-                if back and armed.is_set():
-                    armed.clear()
-                    cuts.append(1)
-                    break
-                b.sendall(data)
-        except OSError:
-            pass
-        for each in (a, b):
-            try:
-                each.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
-
-    def accept():
-        while True:
-            try:
-                a, _ = listener.accept()
-            except OSError:
-                return
-            b = socket.create_connection((host, int(port)))
-            for args in ((a, b, False), (b, a, True)):
-                threading.Thread(target=pump, args=args, daemon=True).start()
-
-    threading.Thread(target=accept, daemon=True).start()
-    proxy = f"127.0.0.1:{listener.getsockname()[1]}"
-    with gc.Client(proxy) as c, c.create_session() as s:
-        armed.set()
-        assert s.observe(frames[0]).step == 0
-        assert cuts == [1] and s.refresh().next_step == 1
-    with gc.Client(proxy, retries=gc.Retries(attempts=1)) as once:
+def test_lost_answer_is_asked_for_again(client, cutting, frames, dimension):
+    action = np.full(dimension, 0.1)
+    wanted = ["objects", "latents", "frame"]
+    with gc.Client(cutting.address) as c, c.create_session() as s, client.create_session() as whole:
+        cutting.cut_the_next_answer()
+        first = s.observe(frames[0], outputs=wanted)
+        assert first.repeated and cutting.cuts == 1 and s.refresh().next_step == 1
+        # The stored answer has the bytes of one that was not lost, and asking once more moves nothing.
+        plain, again = whole.observe(frames[0], outputs=wanted), s.observe(frames[0], outputs=wanted, step=0)
+        for name, values in plain.outputs.items():
+            assert values.tobytes() == first.outputs[name].tobytes() == again.outputs[name].tobytes()
+        assert plain.objects == first.objects == again.objects and not plain.repeated
+        with pytest.raises(gc.Conflict):
+            s.observe(frames[1], outputs=wanted, step=0)
+        assert s.observe(frames[1], action).step == 1
+    with gc.Client(cutting.address, retries=gc.Retries(attempts=1)) as once:
         session = once.create_session()
-        armed.set()
+        cutting.cut_the_next_answer()
         with pytest.raises(gc.Unavailable):
             session.observe(frames[0])
-    listener.close()
+        client.session(session.id).delete()
+
+
+def test_sessions_are_listed(client):
+    opened = {client.create_session(label="listed").id for _ in range(3)}
+    with client.create_session(label="other") as other:
+        assert {each.id for each in client.sessions(label="listed")} == opened
+        assert opened | {other.id} <= {each.id for each in client.sessions()}
+    for each in opened:
+        client.session(each).delete()
+    assert client.sessions(label="listed") == ()
+
+
+def test_a_session_that_has_moved_is_refused(client, frames, dimension):
+    actions = np.zeros((1, 2, dimension))
+    target = gc.costs.program(gc.costs.to_target("all_objects", 0, 0))
+    with client.create_session() as s:
+        s.observe(frames[0])
+        s.observe(frames[1], actions[0, 0])
+        calls = [
+            lambda at: s.imagine(actions, outputs=["latents"], at_step=at), lambda at: s.export(at_step=at),
+            lambda at: s.score(actions, target, at_step=at),
+            lambda at: s.plan(2, target, optimiser=gc.RandomShooting(candidates=2), at_step=at),
+        ]
+        for call in calls:
+            call(1)
+            with pytest.raises(gc.Conflict) as e:
+                call(0)
+            assert e.value.reason
+        (fork,) = s.fork(at_step=1)
+        fork.delete()
+        with pytest.raises(gc.Conflict):
+            s.fork(at_step=0)
+        many = [gc.Prediction(1, s.id, actions, at_step=1), gc.Prediction(2, s.id, actions, at_step=0)]
+        failed = {part.key: part.error for part in client.predict_batch(many, outputs=["latents"])}
+        assert failed[1] is None and isinstance(failed[2], gc.Conflict)

@@ -75,6 +75,15 @@ class Simulator:
         """The action that the script of the data sets would take now."""
         return self._ask({"op": "scripted_action"})["action"]
 
+    def futures(self, candidates):
+        """The objects after each action of each candidate `[N][H][A]`, as in `Observation.state`; nothing has moved."""
+        return self._ask({"op": "futures", "candidates": _numbers(candidates)})["futures"]
+
+    def hand_moves(self, candidates):
+        """Actions that move the hand by `[N][H][2]` metres along x and y of the table: `action`, and the hand's
+        `position` and `pixel` after it, if nothing is in the way."""
+        return self._ask({"op": "hand_moves", "candidates": _numbers(candidates)})["moves"]
+
     def close(self):
         """Ends the program."""
         self._process.stdin.close()
@@ -127,3 +136,10 @@ class Simulator:
             said = self._said.read().decode(errors="replace").strip()
             self.close()
         return SimulatorError(said or "the simulator has ended")
+
+
+def _numbers(nested):
+    """Nested sequences of numbers, NumPy's too, as lists of floats."""
+    if hasattr(nested, "tolist"):
+        return nested.tolist()
+    return float(nested) if not hasattr(nested, "__len__") else [_numbers(each) for each in nested]

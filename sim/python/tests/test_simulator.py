@@ -38,12 +38,23 @@ class SimulatorTest(unittest.TestCase):
             away = ((at[0][0] - 0.52) ** 2 + (at[0][1] - 0.1) ** 2) ** 0.5
             self.assertAlmostEqual(after.state["goal_distance"], away, places=3)
 
+    def test_futures_come_true(self):
+        with Simulator("push1", size=16) as scene:
+            scene.reset(7)
+            moves = scene.hand_moves([[[0.02, 0.0]] * 2, [[0.0, 0.02]] * 2])
+            candidates = [[step["action"] for step in way] for way in moves]
+            futures = scene.futures(candidates)
+            for action, objects in zip(candidates[1], futures[1]):
+                self.assertEqual(scene.step(action).state["objects"], objects)
+            with self.assertRaisesRegex(SimulatorError, "has 7 numbers, not 6"):
+                scene.futures([[[0.0] * 6]])
+
     def test_what_is_refused_changes_nothing(self):
         with Simulator("balls3", size=16) as scene:
             for ask, sentence in [
                 (lambda: scene.step([]), "the scene was not reset yet"),
                 (lambda: scene.step([0.5]), "an action of balls3 has 0 numbers, not 1"),
-                (lambda: scene.set_goal([]), "nobody acts in balls3, so it takes no goal"),
+                (lambda: scene.set_goal([]), "nobody acts in balls3, so it takes neither goals nor candidates"),
             ]:
                 with self.assertRaises(SimulatorError) as refused:
                     ask()

@@ -9,7 +9,7 @@ use rand::{RngExt as _, rngs::ChaCha8Rng};
 use rand_distr::StandardNormal;
 
 use crate::{
-    Environment, Error, Goal, ObjectState, Observation, Result, Scene, SceneSpec, State,
+    Environment, Error, Goal, HandMove, ObjectState, Observation, Result, Scene, SceneSpec, State,
     balls::{motion::Motion, picture::View},
     seeds::{Stream, rng},
 };
@@ -125,6 +125,14 @@ impl Environment for Balls {
     }
 
     fn set_goal(&mut self, _goal: &Goal) -> Result<Observation> {
+        Err(Error::NobodyActs { scene: self.spec.scene })
+    }
+
+    fn futures(&mut self, _candidates: &[Vec<Vec<f32>>]) -> Result<Vec<Vec<Vec<ObjectState>>>> {
+        Err(Error::NobodyActs { scene: self.spec.scene })
+    }
+
+    fn hand_moves(&mut self, _candidates: &[Vec<[f64; 2]>]) -> Result<Vec<Vec<HandMove>>> {
         Err(Error::NobodyActs { scene: self.spec.scene })
     }
 }

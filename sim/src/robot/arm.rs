@@ -32,7 +32,7 @@ const DAMPING: f64 = 1e-4;
 const LIMIT_MARGIN: f64 = 0.02;
 
 /// The arm's kinematics and what it is commanded to do.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Arm {
     /// For postures that are tried out.
     scratch: MjData<Rc<MjModel>>,
@@ -148,13 +148,24 @@ impl Arm {
 
     /// The joint velocities that bring the hand to `target` within a frame, slowed down together where one would be too
     /// fast: cut off one by one they would bend the way, down through the table for instance.
-    pub(crate) fn velocities(&mut self, world: &World, layout: &Layout, target: &Target) -> Joints {
-        let from = world.arm();
+    pub(crate) fn velocities(
+        &mut self,
+        from: [f64; ARM],
+        layout: &Layout,
+        target: &Target,
+    ) -> Joints {
         let to = self.posture(from, target, ROUNDS_FRAME);
         let velocities = (Joints::from(to) - Joints::from(from)) / layout.period;
         // A hair less than the bound, because the action is rounded to f32.
         let most = f64::from(MAX_JOINT_VELOCITY) * (1.0 - 1e-6);
         velocities * (most / velocities.amax()).min(1.0)
+    }
+
+    /// Where the hand is in a posture.
+    pub(crate) fn hand(&mut self, posture: [f64; ARM]) -> Vector3<f64> {
+        self.scratch.qpos_mut()[..ARM].copy_from_slice(&posture);
+        self.scratch.kinematics();
+        self.scratch.site_xpos()[self.site].into()
     }
 
     /// Position and rotation that are lacking.
@@ -259,7 +270,7 @@ mod tests {
     fn velocities_are_slowed_down_together() {
         let (mut arm, world, layout) = arm(Scene::Push1);
         let far = Target { position: Vector3::new(0.6, 0.25, 0.03), rotation: down(0.5) };
-        let velocities = arm.velocities(&world, layout, &far);
+        let velocities = arm.velocities(world.arm(), layout, &far);
         let most = f64::from(MAX_JOINT_VELOCITY);
         assert!((velocities.amax() - most).abs() < 1e-5, "{velocities}");
         let to = arm.posture(world.arm(), &far, ROUNDS_FRAME);

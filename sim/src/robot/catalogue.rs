@@ -106,7 +106,7 @@ pub(crate) struct Script {
 /// Largest joint velocity, rad/s: that of the real Panda's slower joints.
 pub(crate) const MAX_JOINT_VELOCITY: f32 = 2.1;
 /// Largest displacement of the gripper along an axis in one frame, metres.
-const MAX_DISPLACEMENT: f32 = 0.06;
+pub(crate) const MAX_DISPLACEMENT: f32 = 0.06;
 /// Largest rotation of the gripper about an axis in one frame, radians.
 pub(crate) const MAX_ROTATION: f32 = 0.2;
 

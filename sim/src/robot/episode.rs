@@ -8,7 +8,7 @@ use crate::{
     camera::Camera,
     robot::{
         arm::{Arm, Target, down},
-        catalogue::{Control, Layout, MAX_ROTATION, Tray},
+        catalogue::{Control, Layout, MAX_DISPLACEMENT, MAX_ROTATION, Tray},
         sweep::{RIM_MARGIN, Sweeps},
         world::{JOINTS, Object, Touches, World},
     },
@@ -101,7 +101,7 @@ impl Episode {
                 let hand = self.world.hand();
                 let position = next(Vector3::new(hand.x, hand.y, layout.script.height));
                 let target = Target { position, rotation: down(self.yaw) };
-                let velocities = self.arm.velocities(&self.world, layout, &target);
+                let velocities = self.arm.velocities(self.world.arm(), layout, &target);
                 velocities.iter().map(|&velocity| velocity as f32).collect()
             }
             Control::Gripper => {
@@ -115,6 +115,56 @@ impl Episode {
                     .collect()
             }
         }
+    }
+
+    /// The world after each of these actions. This episode stays where it is.
+    pub(crate) fn future(
+        &self,
+        layout: &Layout,
+        actions: &[Vec<f32>],
+    ) -> impl Iterator<Item = World> {
+        let (mut world, mut arm) = (self.world.clone(), self.arm.clone());
+        let mut touches = Touches::none(world.objects());
+        actions.iter().map(move |action| {
+            let action: Vec<f64> = action.iter().copied().map(f64::from).collect();
+            arm.hold(&mut world, layout, &action, &mut touches);
+            world.clone()
+        })
+    }
+
+    /// The actions that displace the hand, and where it is after each.
+    pub(crate) fn hand_moves(
+        &mut self,
+        layout: &Layout,
+        displacements: &[[f64; 2]],
+    ) -> Vec<(Vec<f32>, Vector3<f64>)> {
+        let (mut arm, mut hand) = (self.world.arm(), self.world.hand());
+        if layout.control == Control::Gripper {
+            hand = self.arm.target.position;
+        }
+        let mut one = |&[x, y]: &[f64; 2]| {
+            let [x, y] = layout.tray.clamp([hand.x + x, hand.y + y], RIM_MARGIN);
+            let position = Vector3::new(x, y, layout.script.height);
+            match layout.control {
+                Control::JointVelocity => {
+                    let target = Target { position, rotation: down(self.yaw) };
+                    let velocities = self.arm.velocities(arm, layout, &target);
+                    for (joint, velocity) in arm.iter_mut().zip(velocities.iter()) {
+                        *joint += velocity * layout.period;
+                    }
+                    hand = self.arm.hand(arm);
+                    (velocities.iter().map(|&velocity| velocity as f32).collect(), hand)
+                }
+                Control::Gripper => {
+                    let most = f64::from(MAX_DISPLACEMENT);
+                    let way = (position - hand).map(|part| part.clamp(-most, most));
+                    hand += way;
+                    let action = [way.x, way.y, way.z, 0.0, 0.0, 0.0, self.opening];
+                    (action.iter().map(|&value| value as f32).collect(), hand)
+                }
+            }
+        };
+        displacements.iter().map(&mut one).collect()
     }
 
     /// Takes a goal and returns the world with the objects there.
@@ -145,15 +195,7 @@ impl Episode {
         size: u32,
         touches: Touches,
     ) -> State {
-        let object = |object| {
-            let position = world.position(object);
-            ObjectState {
-                position,
-                quaternion: world.quaternion(object),
-                pixel: camera.project(position.into(), size),
-            }
-        };
-        let objects: Vec<_> = (0..world.objects()).map(object).collect();
+        let objects = objects(world, camera, size);
         let hand = world.hand();
         let turned = Rotation3::from_matrix_unchecked(world.hand_axes());
         let turned = UnitQuaternion::from_rotation_matrix(&turned);
@@ -168,6 +210,19 @@ impl Episode {
             full: [world.data.qpos(), world.data.qvel()].concat(),
         }
     }
+}
+
+/// The objects of a world and where they appear.
+pub(crate) fn objects(world: &World, camera: &Camera, size: u32) -> Vec<ObjectState> {
+    let object = |object| {
+        let position = world.position(object);
+        ObjectState {
+            position,
+            quaternion: world.quaternion(object),
+            pixel: camera.project(position.into(), size),
+        }
+    };
+    (0..world.objects()).map(object).collect()
 }
 
 /// Places on the tray with room between the objects.

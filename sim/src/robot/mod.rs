@@ -14,9 +14,10 @@ mod sweep;
 mod world;
 
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
+use nalgebra::Vector3;
 
 use crate::{
-    Environment, Error, Goal, Observation, Result, Scene, SceneSpec,
+    Environment, Error, Goal, HandMove, ObjectState, Observation, Result, Scene, SceneSpec,
     camera::Camera,
     robot::{
         catalogue::Layout,
@@ -91,6 +92,32 @@ impl Environment for RobotScene {
         let (rgb, mask) = self.view.of(&mut shown)?;
         let state = episode.state(&shown, &self.camera, self.spec.size, touches);
         Ok(Observation { rgb, mask, state })
+    }
+
+    fn futures(&mut self, candidates: &[Vec<Vec<f32>>]) -> Result<Vec<Vec<Vec<ObjectState>>>> {
+        let episode = self.episode.as_ref().ok_or(Error::NotReset)?;
+        candidates.iter().flatten().try_for_each(|action| self.spec.check(action))?;
+        let (camera, size) = (&self.camera, self.spec.size);
+        let future = |actions: &Vec<Vec<f32>>| {
+            let worlds = episode.future(self.layout, actions);
+            worlds.map(|world| episode::objects(&world, camera, size)).collect()
+        };
+        Ok(candidates.iter().map(future).collect())
+    }
+
+    fn hand_moves(&mut self, candidates: &[Vec<[f64; 2]>]) -> Result<Vec<Vec<HandMove>>> {
+        let episode = self.episode.as_mut().ok_or(Error::NotReset)?;
+        let (camera, size) = (&self.camera, self.spec.size);
+        let mut moves = |displacements: &Vec<[f64; 2]>| -> Vec<HandMove> {
+            let moves = episode.hand_moves(self.layout, displacements).into_iter();
+            let seen = |(action, hand)| HandMove {
+                action,
+                position: Vector3::into(hand),
+                pixel: camera.project(hand, size),
+            };
+            moves.map(seen).collect()
+        };
+        Ok(candidates.iter().map(&mut moves).collect())
     }
 }
 

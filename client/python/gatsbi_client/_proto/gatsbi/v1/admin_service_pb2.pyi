@@ -38,7 +38,7 @@ class UnloadModelRequest(_message.Message):
     CLOSE_SESSIONS_FIELD_NUMBER: _ClassVar[int]
     model: str
     close_sessions: bool
-    def __init__(self, model: _Optional[str] = ..., close_sessions: _Optional[bool] = ...) -> None: ...
+    def __init__(self, model: _Optional[str] = ..., close_sessions: bool = ...) -> None: ...
 
 class UnloadModelResponse(_message.Message):
     __slots__ = ("closed_sessions",)

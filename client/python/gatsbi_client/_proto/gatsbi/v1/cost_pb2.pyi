@@ -112,7 +112,7 @@ class Subject(_message.Message):
     object_id: int
     agent: bool
     all_objects: bool
-    def __init__(self, object_id: _Optional[int] = ..., agent: _Optional[bool] = ..., all_objects: _Optional[bool] = ...) -> None: ...
+    def __init__(self, object_id: _Optional[int] = ..., agent: bool = ..., all_objects: bool = ...) -> None: ...
 
 class Point(_message.Message):
     __slots__ = ("x", "y")
@@ -170,7 +170,7 @@ class Region(_message.Message):
     subject: Subject
     box: Box
     keep_out: bool
-    def __init__(self, subject: _Optional[_Union[Subject, _Mapping]] = ..., box: _Optional[_Union[Box, _Mapping]] = ..., keep_out: _Optional[bool] = ...) -> None: ...
+    def __init__(self, subject: _Optional[_Union[Subject, _Mapping]] = ..., box: _Optional[_Union[Box, _Mapping]] = ..., keep_out: bool = ...) -> None: ...
 
 class Box(_message.Message):
     __slots__ = ("left", "top", "right", "bottom")

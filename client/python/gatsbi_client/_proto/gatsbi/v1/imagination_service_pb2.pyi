@@ -63,7 +63,7 @@ class RolloutChunk(_message.Message):
     last: bool
     timing: _step_pb2.Timing
     over_samples: bool
-    def __init__(self, at_step: _Optional[int] = ..., model_hash: _Optional[str] = ..., seed: _Optional[int] = ..., sample: _Optional[int] = ..., first_candidate: _Optional[int] = ..., candidates: _Optional[int] = ..., depths: _Optional[_Iterable[int]] = ..., outputs: _Optional[_Iterable[_Union[_output_pb2.OutputValue, _Mapping]]] = ..., last: _Optional[bool] = ..., timing: _Optional[_Union[_step_pb2.Timing, _Mapping]] = ..., over_samples: _Optional[bool] = ...) -> None: ...
+    def __init__(self, at_step: _Optional[int] = ..., model_hash: _Optional[str] = ..., seed: _Optional[int] = ..., sample: _Optional[int] = ..., first_candidate: _Optional[int] = ..., candidates: _Optional[int] = ..., depths: _Optional[_Iterable[int]] = ..., outputs: _Optional[_Iterable[_Union[_output_pb2.OutputValue, _Mapping]]] = ..., last: bool = ..., timing: _Optional[_Union[_step_pb2.Timing, _Mapping]] = ..., over_samples: bool = ...) -> None: ...
 
 class Start(_message.Message):
     __slots__ = ("session", "snapshot", "context")

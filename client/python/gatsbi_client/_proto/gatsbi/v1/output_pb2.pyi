@@ -62,7 +62,7 @@ class OutputSelection(_message.Message):
     encoding: Encoding
     every_k: int
     last_only: bool
-    def __init__(self, outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., every_k: _Optional[int] = ..., last_only: _Optional[bool] = ...) -> None: ...
+    def __init__(self, outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., every_k: _Optional[int] = ..., last_only: bool = ...) -> None: ...
 
 class OutputValue(_message.Message):
     __slots__ = ("output", "tensor", "images", "tracks")

@@ -42,7 +42,7 @@ class ScoreRequest(_message.Message):
     by_sample: bool
     by_term: bool
     timeout_millis: int
-    def __init__(self, session_id: _Optional[str] = ..., at_step: _Optional[int] = ..., actions: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., sampling: _Optional[_Union[_step_pb2.Sampling, _Mapping]] = ..., costs: _Optional[_Union[_cost_pb2.CostProgram, _Mapping]] = ..., by_sample: _Optional[bool] = ..., by_term: _Optional[bool] = ..., timeout_millis: _Optional[int] = ...) -> None: ...
+    def __init__(self, session_id: _Optional[str] = ..., at_step: _Optional[int] = ..., actions: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ..., sampling: _Optional[_Union[_step_pb2.Sampling, _Mapping]] = ..., costs: _Optional[_Union[_cost_pb2.CostProgram, _Mapping]] = ..., by_sample: bool = ..., by_term: bool = ..., timeout_millis: _Optional[int] = ...) -> None: ...
 
 class ScoreResponse(_message.Message):
     __slots__ = ("at_step", "model_hash", "seed", "costs", "violations", "by_sample", "by_term", "best", "timing")
@@ -154,7 +154,7 @@ class WarmStart(_message.Message):
     ACTIONS_FIELD_NUMBER: _ClassVar[int]
     previous: bool
     actions: _tensor_pb2.Tensor
-    def __init__(self, previous: _Optional[bool] = ..., actions: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ...) -> None: ...
+    def __init__(self, previous: bool = ..., actions: _Optional[_Union[_tensor_pb2.Tensor, _Mapping]] = ...) -> None: ...
 
 class PlanResponse(_message.Message):
     __slots__ = ("at_step", "model_hash", "seed", "actions", "cost", "violation", "std", "best_costs", "iterations", "candidates", "stop", "outputs", "depths", "timing")

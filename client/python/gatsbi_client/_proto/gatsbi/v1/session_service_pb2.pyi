@@ -45,7 +45,7 @@ class Session(_message.Message):
     keep_frames: int
     oldest_step: int
     latest_wins: bool
-    def __init__(self, id: _Optional[str] = ..., label: _Optional[str] = ..., model: _Optional[str] = ..., model_hash: _Optional[str] = ..., next_step: _Optional[int] = ..., mode: _Optional[_Union[_step_pb2.Mode, str]] = ..., seed: _Optional[int] = ..., created_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., used_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., expires_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., bytes: _Optional[int] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., oldest_step: _Optional[int] = ..., latest_wins: _Optional[bool] = ...) -> None: ...
+    def __init__(self, id: _Optional[str] = ..., label: _Optional[str] = ..., model: _Optional[str] = ..., model_hash: _Optional[str] = ..., next_step: _Optional[int] = ..., mode: _Optional[_Union[_step_pb2.Mode, str]] = ..., seed: _Optional[int] = ..., created_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., used_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., expires_at: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., bytes: _Optional[int] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., oldest_step: _Optional[int] = ..., latest_wins: bool = ...) -> None: ...
 
 class CreateSessionRequest(_message.Message):
     __slots__ = ("model", "label", "mode", "seed", "ttl", "keep_steps", "keep_frames", "latest_wins")
@@ -65,7 +65,7 @@ class CreateSessionRequest(_message.Message):
     keep_steps: int
     keep_frames: int
     latest_wins: bool
-    def __init__(self, model: _Optional[str] = ..., label: _Optional[str] = ..., mode: _Optional[_Union[_step_pb2.Mode, str]] = ..., seed: _Optional[int] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., latest_wins: _Optional[bool] = ...) -> None: ...
+    def __init__(self, model: _Optional[str] = ..., label: _Optional[str] = ..., mode: _Optional[_Union[_step_pb2.Mode, str]] = ..., seed: _Optional[int] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., latest_wins: bool = ...) -> None: ...
 
 class CreateSessionResponse(_message.Message):
     __slots__ = ("session",)
@@ -219,7 +219,7 @@ class ImportSessionRequest(_message.Message):
     keep_steps: int
     keep_frames: int
     latest_wins: bool
-    def __init__(self, snapshot: _Optional[bytes] = ..., session_id: _Optional[str] = ..., label: _Optional[str] = ..., seed: _Optional[int] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., latest_wins: _Optional[bool] = ...) -> None: ...
+    def __init__(self, snapshot: _Optional[bytes] = ..., session_id: _Optional[str] = ..., label: _Optional[str] = ..., seed: _Optional[int] = ..., ttl: _Optional[_Union[datetime.timedelta, _duration_pb2.Duration, _Mapping]] = ..., keep_steps: _Optional[int] = ..., keep_frames: _Optional[int] = ..., latest_wins: bool = ...) -> None: ...
 
 class ImportSessionResponse(_message.Message):
     __slots__ = ("session",)

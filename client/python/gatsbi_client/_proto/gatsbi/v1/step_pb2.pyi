@@ -28,7 +28,7 @@ class Sampling(_message.Message):
     seed: int
     samples: int
     independent_candidates: bool
-    def __init__(self, mode: _Optional[_Union[Mode, str]] = ..., seed: _Optional[int] = ..., samples: _Optional[int] = ..., independent_candidates: _Optional[bool] = ...) -> None: ...
+    def __init__(self, mode: _Optional[_Union[Mode, str]] = ..., seed: _Optional[int] = ..., samples: _Optional[int] = ..., independent_candidates: bool = ...) -> None: ...
 
 class Observation(_message.Message):
     __slots__ = ("step", "image", "action")
@@ -60,7 +60,7 @@ class Belief(_message.Message):
     objects: _containers.RepeatedCompositeFieldContainer[_output_pb2.Object]
     timing: Timing
     image_skipped: bool
-    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., model_hash: _Optional[str] = ..., predicted: _Optional[bool] = ..., repeated: _Optional[bool] = ..., outputs: _Optional[_Iterable[_Union[_output_pb2.OutputValue, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[_output_pb2.Object, _Mapping]]] = ..., timing: _Optional[_Union[Timing, _Mapping]] = ..., image_skipped: _Optional[bool] = ...) -> None: ...
+    def __init__(self, session_id: _Optional[str] = ..., step: _Optional[int] = ..., model_hash: _Optional[str] = ..., predicted: bool = ..., repeated: bool = ..., outputs: _Optional[_Iterable[_Union[_output_pb2.OutputValue, _Mapping]]] = ..., objects: _Optional[_Iterable[_Union[_output_pb2.Object, _Mapping]]] = ..., timing: _Optional[_Union[Timing, _Mapping]] = ..., image_skipped: bool = ...) -> None: ...
 
 class Timing(_message.Message):
     __slots__ = ("queue_micros", "compute_micros", "encode_micros")
