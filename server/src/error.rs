@@ -176,7 +176,9 @@ pub enum Error {
         expected: String,
     },
     /// A session whose last step was not observed by itself.
-    #[error("step {last} cannot be shown: the session was rewound or imported to it, or moved to another model")]
+    #[error(
+        "step {last} cannot be shown: the session was rewound or imported to it, or moved to another model"
+    )]
     NothingToShow {
         /// The last step.
         last: u64,

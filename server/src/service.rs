@@ -137,7 +137,9 @@ impl Service {
 }
 
 /// Runs what takes long where it keeps nobody waiting.
-pub(crate) async fn aside<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+pub(crate) async fn aside<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Error> {
     let span = tracing::Span::current();
     let work = tokio::task::spawn_blocking(move || span.in_scope(work));
     // It can only fail to run when the process goes down, or by a panic, which is a bug of ours.

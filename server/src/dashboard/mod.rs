@@ -4,16 +4,12 @@
 //! elsewhere, and holds nothing that is anybody's: what it shows it asks for, with a key where the server wants one.
 //! Start reading at `page/app.js`.
 
-use std::sync::Arc;
-
 use axum::{
     Router,
     http::header::{self, HeaderName},
     response::IntoResponse,
     routing::get,
 };
-
-use crate::service::Service;
 
 /// What the page may do: scripts, styles and data from this server alone.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; \
@@ -45,8 +41,8 @@ const FILES: &[(&str, &str, &str)] = &[
     ("/page/sessions.js", SCRIPT, include_str!("page/sessions.js")),
 ];
 
-/// All paths.
-pub fn routes() -> Router<Arc<Service>> {
+/// All paths, which are anybody's, whatever else a router serves.
+pub fn routes<S: Clone + Send + Sync + 'static>() -> Router<S> {
     FILES.iter().fold(Router::new(), |router, (path, media, text)| {
         router.route(path, get(async || file(media, text)))
     })

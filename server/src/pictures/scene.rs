@@ -108,7 +108,8 @@ impl Scene {
             RgbImage::from_fn(size.0, size.1, |x, y| Rgb([mask((y * size.0 + x) as usize); 3]))
         };
         let mut tiles: Vec<(String, RgbImage)> = Vec::new();
-        let mut add = |caption: String, tile: &RgbImage| tiles.push((caption, enlarge(tile, scale)));
+        let mut add =
+            |caption: String, tile: &RgbImage| tiles.push((caption, enlarge(tile, scale)));
         if shown.seen.frame.is_some() {
             add("camera".to_owned(), &picture(shown, Of::Camera));
         }

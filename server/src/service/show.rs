@@ -158,15 +158,15 @@ impl Watching {
             () = stop.cancelled() => None,
         }
     }
+
+    /// Whether it ends because the server goes down: the session may be there again when the server is.
+    pub fn is_stopped(&self) -> bool {
+        self.service.stop().is_cancelled()
+    }
 }
 
 /// A step as it is shown.
-pub(super) fn shown(
-    spec: &ModelSpec,
-    seen: Seen,
-    values: Vec<Value>,
-    timing: v1::Timing,
-) -> Shown {
+pub(super) fn shown(spec: &ModelSpec, seen: Seen, values: Vec<Value>, timing: v1::Timing) -> Shown {
     Shown {
         step: seen.step,
         model_hash: spec.hash.clone(),

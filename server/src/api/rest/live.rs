@@ -21,7 +21,7 @@ use axum::{
 };
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use bytes::Bytes;
-use futures_util::{Stream, stream::unfold};
+use futures_util::{Stream, StreamExt as _, stream::unfold};
 use gatsbi_models::scene::Output;
 use gatsbi_proto::v1;
 use serde::Deserialize;
@@ -31,7 +31,7 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use super::{App, answer};
 use crate::{
     api::counted,
-    engine::Reading,
+    engine::{Computed, Reading},
     error::Error,
     media,
     pictures::{
@@ -57,9 +57,7 @@ const THUMBNAILS: usize = 24;
 
 /// All paths.
 pub(super) fn routes() -> Router<Arc<Service>> {
-    Router::new()
-        .route("/v1/live", get(server))
-        .route("/v1/sessions/{id}/live", get(session))
+    Router::new().route("/v1/live", get(server)).route("/v1/sessions/{id}/live", get(session))
 }
 
 /// Which pictures of a step are wanted.
@@ -91,6 +89,9 @@ async fn session(
     let events = unfold(Some(watching), move |watching| async move {
         let mut watching = watching?;
         let Some(shown) = watching.next().await else {
+            if watching.is_stopped() {
+                return None;
+            }
             let closed = Event::default().event("closed").data("{}");
             return Some((closed, None));
         };
@@ -170,7 +171,8 @@ impl Feed {
             paint.collect::<Vec<_>>()
         });
         let thumbnails = thumbnails.await.ok()?;
-        let open_ids: Vec<String> = sessions.iter().map(|told| told.session.id.to_string()).collect();
+        let open_ids: Vec<String> =
+            sessions.iter().map(|told| told.session.id.to_string()).collect();
         self.sent.retain(|id, _| open_ids.contains(id));
         self.sent.extend(thumbnails.iter().map(|(id, next_step, _)| (id.clone(), *next_step)));
         let told = |Told { session, model, next_step, idle }: &Told| {
@@ -198,7 +200,7 @@ impl Feed {
 }
 
 fn read(engine: &Reading) -> Json {
-    let kind = |computed: &crate::engine::Computed| {
+    let kind = |computed: &Computed| {
         json!({
             "blocks": computed.blocks,
             "rows": computed.rows,
@@ -235,9 +237,9 @@ fn tell(shown: &Shown, with: With) -> Json {
             "pixel_y": object.pixel_y,
         })
     };
-    let keypoints = shown.floats(Output::Keypoints);
-    let keypoints = keypoints.map(|numbers| numbers.chunks(3).map(<[f32]>::to_vec).collect());
-    let keypoints: Option<Vec<Vec<f32>>> = keypoints;
+    let keypoints = shown
+        .floats(Output::Keypoints)
+        .map(|numbers| numbers.chunks(3).map(<[f32]>::to_vec).collect::<Vec<_>>());
     let mut told = json!({
         "step": shown.step,
         "at": millis(shown.at),
@@ -311,14 +313,16 @@ fn with(pictures: &str) -> Result<With, Error> {
 }
 
 /// Events as an answer that nothing on the way keeps back.
-fn stream(
-    method: &'static str,
-    events: impl Stream<Item = Event> + Send + 'static,
-) -> Response {
-    use futures_util::StreamExt as _;
+fn stream(method: &'static str, events: impl Stream<Item = Event> + Send + 'static) -> Response {
     let events = counted::stream("rest", method, events).map(Ok::<_, Infallible>);
     let events = Sse::new(events).keep_alive(KeepAlive::new().interval(Duration::from_secs(10)));
-    ([(header::CACHE_CONTROL, "no-store"), (header::HeaderName::from_static("x-accel-buffering"), "no")], events)
+    (
+        [
+            (header::CACHE_CONTROL, "no-store"),
+            (header::HeaderName::from_static("x-accel-buffering"), "no"),
+        ],
+        events,
+    )
         .into_response()
 }
 

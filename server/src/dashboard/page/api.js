@@ -46,10 +46,14 @@ async function send(path, options = {}) {
     response = await fetch(path, request);
   } catch (error) {
     if (error.name === "AbortError") throw error;
+    say("lost");
     throw new Problem(0, { title: "No connection", detail: "The server cannot be reached." });
   }
+  say("live");
   return answer(response);
 }
+
+const say = (state, seconds) => events.dispatchEvent(new CustomEvent("connection", { detail: { state, seconds } }));
 
 /** Asks for a JSON document. */
 export const ask = async (path, options) => (await send(path, options)).json();
@@ -89,8 +93,6 @@ async function* split(stream, mark) {
   }
 }
 
-const say = (state, seconds) => events.dispatchEvent(new CustomEvent("connection", { detail: { state, seconds } }));
-
 /**
  * Follows a feed of server-sent events until `signal` is aborted, and begins again when it is lost.
  * `heard(name, data)` gets every event, `refused(problem)` what cannot be mended by waiting.
@@ -100,7 +102,6 @@ export async function follow(path, signal, heard, refused) {
   while (!signal.aborted) {
     try {
       const response = await send(path, { accept: "text/event-stream", signal });
-      say("live");
       for await (const event of split(response.body, "\n\n")) {
         wait = 0.5;
         const field = (name) => event.split("\n").find((line) => line.startsWith(`${name}:`))?.slice(name.length + 1).trim();

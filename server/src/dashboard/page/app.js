@@ -45,7 +45,8 @@ events.addEventListener("connection", ({ detail: { state, seconds } }) => {
   if (state === "live") lost.hidden = true;
   if (state === "lost") {
     // The words change by the second, which nobody wants read out: the status says once that the connection is lost.
-    put(lost, `Connection lost. What you see is the last that came; trying again in ${seconds} s.`);
+    const next = seconds ? `trying again in ${seconds} s` : "trying again";
+    put(lost, `Connection lost. What you see is the last that came; ${next}.`);
     lost.hidden = false;
   }
 });

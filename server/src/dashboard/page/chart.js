@@ -10,7 +10,7 @@ const POINTS = 240;
  */
 export class Chart {
   constructor(title, { series, format, stacked = false, floor = 0, points = POINTS, unit = "steps" }) {
-    Object.assign(this, { title, series, format, stacked, floor, points, unit, rows: [], said: 0, waiting: false });
+    Object.assign(this, { title, series, format, stacked, floor, points, unit, rows: [], said: -Infinity, waiting: false });
     this.now = h("output", { className: "now", "aria-live": "off" }, "–");
     this.canvas = h("canvas", { role: "img", "aria-label": `${title}: nothing yet` });
     const legend = series.length < 2 ? [] : series.map(([name, variable]) => {
@@ -70,7 +70,7 @@ export class Chart {
     const span = Math.max((this.rows.at(-1)?.at ?? 0) - first, 1);
     const x = (at) => left + ((at - first) / span) * (right - left);
     const y = (value) => low - (value / top) * (low - high);
-    pen.font = "11px ui-sans-serif, system-ui, sans-serif";
+    pen.font = `11px ${getComputedStyle(document.body).fontFamily}`;
     pen.lineWidth = 1;
     pen.strokeStyle = colour("--line");
     pen.fillStyle = colour("--soft");
@@ -82,13 +82,15 @@ export class Chart {
       pen.stroke();
       if (share) pen.fillText(this.format(top * share), left, at + 11);
     }
-    if (this.rows.length > 1) {
+    if (this.rows.length) {
       pen.textAlign = "left";
       pen.fillText(this.label(first), left, height - 3);
-      pen.textAlign = "right";
-      pen.fillText(this.label(this.rows.at(-1).at), right, height - 3);
-      pen.textAlign = "left";
-      this.lines(pen, x, y);
+      if (this.rows.length > 1) {
+        pen.textAlign = "right";
+        pen.fillText(this.label(this.rows.at(-1).at), right, height - 3);
+        pen.textAlign = "left";
+      }
+      this.lines(pen, x, y, first);
     }
     const last = this.rows.at(-1);
     put(this.now, last ? this.format(total(last)) : "–");
@@ -100,7 +102,7 @@ export class Chart {
     return new Date(at).toLocaleTimeString("en-GB");
   }
 
-  lines(pen, x, y) {
+  lines(pen, x, y, first) {
     const below = this.rows.map(() => 0);
     this.series.forEach(([, variable], which) => {
       pen.strokeStyle = pen.fillStyle = colour(variable);
@@ -115,6 +117,13 @@ export class Chart {
       pen.lineWidth = 1.75;
       pen.lineJoin = "round";
       pen.stroke();
+      if (this.rows.length === 1 && Number.isFinite(heights[0])) {
+        // A single point is no line.
+        pen.beginPath();
+        pen.arc(x(first), y(heights[0]), 2.5, 0, 2 * Math.PI);
+        pen.fill();
+        pen.beginPath();
+      }
       if (this.stacked || this.series.length === 1) {
         for (let at = this.rows.length - 1; at >= 0; at--) pen.lineTo(x(this.rows[at].at), y(below[at]));
         pen.globalAlpha = this.stacked ? 0.35 : 0.1;

@@ -28,7 +28,7 @@ export class Rates {
 }
 
 export function engine(main, signal) {
-  const percent = (value) => `${number(100 * value)} %`;
+  const percent = (value) => (Number.isFinite(value) ? `${number(100 * value)} %` : "–");
   const plain = (value) => number(value, value < 10 ? 1 : 0);
   const chart = (title, series, format, more) => new Chart(title, { series, format, unit: "time", ...more });
   const charts = {
@@ -56,7 +56,7 @@ export function engine(main, signal) {
     ),
   );
   const facts = h("p", { className: "soft" });
-  const place = h("div", {}, h("div", { className: "charts" }, Object.values(charts).map((chart) => chart.element)), h("div", { className: "panel scroll", tabIndex: 0, role: "region", "aria-label": "Totals" }, table), facts);
+  const place = h("div", { className: "stack" }, h("div", { className: "charts" }, Object.values(charts).map((chart) => chart.element)), h("div", { className: "panel scroll", tabIndex: 0, role: "region", "aria-label": "Totals" }, table), facts);
   main.append(h("h1", {}, "Engine"), h("p", { className: "lead" }, "One thread owns the models. At each tick it computes one step of every waiting observation, and of as many rows of rollouts as fit."), place);
   const rates = new Rates();
   follow("/v1/live?sessions=0&every_millis=500", signal, (name, overview) => {
@@ -77,7 +77,7 @@ export function engine(main, signal) {
       put(cells[`${name}.fill`], kind.lanes ? percent(kind.rows / kind.lanes) : "–");
       put(cells[`${name}.time`], kind.blocks ? millis(kind.micros / kind.blocks) : "–");
     }
-    put(facts, `${number(ticks)} ticks, ${number(refused)} requests refused. What waits now is predicted to take ${millis(waiting.predicted_micros)}.`);
+    put(facts, `Ticks: ${number(ticks)}. Requests refused: ${number(refused)}. What waits now is predicted to take ${millis(waiting.predicted_micros)}.`);
   }, (problem) => place.replaceChildren(failure(problem)));
   signal.addEventListener("abort", () => Object.values(charts).forEach((chart) => chart.observer.disconnect()));
 }

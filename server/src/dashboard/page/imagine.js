@@ -184,8 +184,8 @@ export class Imagine {
         horizon,
         costs: this.costs(),
         sampling: { mode: "MODE_MEAN" },
-        icem: { cem: { candidates: 32, iterations: 3, elites: 6 } },
-        budget_millis: 8000,
+        icem: { cem: { candidates: 16, iterations: 3, elites: 4 } },
+        budget_millis: 20000,
       };
       const plan = await ask(`/v1/sessions/${this.about.id}/plans`, { body, signal: this.signal });
       const numbers = floats(plan.actions);

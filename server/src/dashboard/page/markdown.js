@@ -35,7 +35,7 @@ export function markdown(text) {
 
 function table(lines) {
   const cells = (line) => line.split("|").slice(1, -1).map((cell) => cell.trim());
-  const rule = (line) => /^\|[\s:|-]+\|$/.test(line.trim());
+  const rule = (line) => /^\|[\s:|-]*-[\s:|-]*\|$/.test(line.trim());
   const [head, ...rows] = lines.filter((line) => !rule(line)).map(cells);
   return h(
     "div",

@@ -44,6 +44,6 @@ function card(model) {
     h("p", { className: "soft hash" }, model.hash),
     h("dl", { className: "facts" }, facts),
     model.actions.length ? h("div", { className: "scroll", tabIndex: 0, role: "region", "aria-label": `Actions of ${model.name}` }, actions) : null,
-    model.card ? h("details", { open: true }, h("summary", {}, "Card"), h("div", { className: "prose" }, markdown(model.card))) : h("p", { className: "soft" }, "It has no card."),
+    model.card ? h("details", { open: true }, h("summary", {}, "Card"), h("div", { className: "prose" }, markdown(model.card.replace(`# ${model.name}\n`, "")))) : h("p", { className: "soft" }, "It has no card."),
   );
 }

@@ -178,7 +178,7 @@ class Objects {
   constructor() {
     this.body = h("tbody", {});
     this.rows = new Map();
-    const columns = ["id", "there", "x", "y", "width", "height", "depth"];
+    const columns = ["id", "presence", "x", "y", "width", "height", "depth"];
     this.none = h("p", { className: "soft" }, "No object yet.");
     const table = h("table", { className: "objects" }, h("thead", {}, h("tr", {}, columns.map((name) => h("th", { scope: "col" }, name)))), this.body);
     this.element = h("div", {}, h("h2", {}, "Objects"), h("div", { className: "scroll", tabIndex: 0, role: "region", "aria-label": "Objects" }, table), this.none);
