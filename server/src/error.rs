@@ -175,6 +175,14 @@ pub enum Error {
         /// What it should be.
         expected: String,
     },
+    /// A session whose last step was not observed by itself.
+    #[error(
+        "step {last} cannot be shown: the session was rewound or imported to it, or moved to another model"
+    )]
+    NothingToShow {
+        /// The last step.
+        last: u64,
+    },
     /// A session without a belief.
     #[error("the session has observed nothing yet")]
     NothingObserved,

@@ -2,7 +2,7 @@
 //!
 //! A request comes in through [`api`], becomes a use case of [`service`], finds its session in [`sessions`], and is
 //! computed by [`engine`]. [`app`] puts it all together, [`config`] says with which sizes, [`error`] what can go
-//! wrong, [`telemetry`] what is counted. Read [`service`] first, then [`engine`].
+//! wrong, [`telemetry`] what is counted. People look through [`dashboard`] and [`pictures`]. Read [`service`] first, then [`engine`].
 //!
 //! What models compute is not known here, only that they observe and imagine ([`gatsbi_models::world_model`]).
 
@@ -10,9 +10,11 @@ pub mod api;
 pub mod app;
 pub mod checkpoints;
 pub mod config;
+pub mod dashboard;
 pub mod engine;
 pub mod error;
 pub mod media;
+pub mod pictures;
 pub mod planning;
 pub mod service;
 pub mod sessions;

@@ -1,7 +1,8 @@
 //! The use cases. gRPC and REST are thin skins over this, and tests may call it directly.
 //!
 //! Requests and answers are the messages of the wire; whatever is wrong with them comes back as [`Error`]. A file a
-//! use case: [`models`], [`sessions`] and [`snapshots`], then [`observe`], [`imagine`] and [`planning`].
+//! use case: [`models`], [`sessions`] and [`snapshots`], then [`observe`], [`imagine`] and [`planning`],
+//! and [`show`] for people.
 
 mod administration;
 mod answer;
@@ -16,6 +17,7 @@ pub mod predict;
 mod programs;
 pub mod rollout;
 mod sessions;
+pub mod show;
 mod snapshots;
 mod spread;
 mod start;
@@ -135,7 +137,9 @@ impl Service {
 }
 
 /// Runs what takes long where it keeps nobody waiting.
-async fn aside<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Error> {
+pub(crate) async fn aside<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Error> {
     let span = tracing::Span::current();
     let work = tokio::task::spawn_blocking(move || span.in_scope(work));
     // It can only fail to run when the process goes down, or by a panic, which is a bug of ours.

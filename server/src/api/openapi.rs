@@ -1,10 +1,11 @@
 //! The REST API as an OpenAPI 3.1 document, made from the messages and their comments.
 //!
-//! What paths there are is said in [`operations`]; what travels on them are the messages of the wire, whose schemas
-//! come from [`schemas`]. The document is checked in (`server/openapi.json`), so that every change of the API is seen.
+//! What paths there are is said in [`operations`] and [`showings`]; what travels on them are the messages of the wire,
+//! whose schemas come from [`schemas`], and what is made for people to look at. The document is checked in (`server/openapi.json`), so that every change of the API is seen.
 
 mod operations;
 mod schemas;
+mod showings;
 
 use std::sync::LazyLock;
 
@@ -16,6 +17,7 @@ use serde_json::{Value as Json, json};
 use self::{
     operations::{Body, OPERATIONS, Operation},
     schemas::{Schemas, reference},
+    showings::SHOWINGS,
 };
 
 /// The document.
@@ -37,6 +39,10 @@ fn document(files: &FileDescriptorSet) -> Json {
         let described = describe(operation, &mut schemas);
         let path = paths.entry(operation.path).or_insert_with(|| json!({}));
         path[operation.method] = described;
+    }
+    for showing in SHOWINGS {
+        let path = paths.entry(showing.path).or_insert_with(|| json!({}));
+        path[showing.method] = showings::describe(showing);
     }
     let mut components = schemas.into_components();
     components["Problem"] = problem();
@@ -70,10 +76,7 @@ fn describe(operation: &Operation, schemas: &mut Schemas<'_>) -> Json {
                 "description": schemas.comment(&rpc.output),
                 "content": answer(operation, &rpc.output),
             },
-            "default": {
-                "description": "What is wrong, in which field, and what was expected.",
-                "content": { PROBLEM: { "schema": { "$ref": "#/components/schemas/Problem" } } },
-            },
+            "default": problem_answer(),
         },
     });
     let message = || reference(&rpc.input);
@@ -112,20 +115,32 @@ fn answer(operation: &Operation, output: &str) -> Json {
 }
 
 fn parameters(operation: &Operation) -> Vec<Json> {
-    let in_path = operation.path.split('/').filter_map(|part| part.strip_prefix('{'));
-    let path = in_path.map(|part| {
+    path_parameters(operation.path).chain(query_parameters(operation.query)).collect()
+}
+
+fn path_parameters(path: &'static str) -> impl Iterator<Item = Json> {
+    path.split('/').filter_map(|part| part.strip_prefix('{')).map(|part| {
         let name = part.trim_end_matches('}');
         let schema = match name {
             "id" => json!({ "type": "string", "pattern": "^[0-9a-f]{32}$" }),
             _ => json!({ "type": "string" }),
         };
         json!({ "name": name, "in": "path", "required": true, "schema": schema })
-    });
-    let query = operation.query.iter().map(|(name, kind, about)| {
+    })
+}
+
+fn query_parameters(query: &[(&str, &str, &str)]) -> impl Iterator<Item = Json> {
+    query.iter().map(|(name, kind, about)| {
         let schema = json!({ "type": kind });
         json!({ "name": name, "in": "query", "description": about, "schema": schema })
-    });
-    path.chain(query).collect()
+    })
+}
+
+fn problem_answer() -> Json {
+    json!({
+        "description": "What is wrong, in which field, and what was expected.",
+        "content": { PROBLEM: { "schema": { "$ref": "#/components/schemas/Problem" } } },
+    })
 }
 
 /// An observation as a form, for people with curl.

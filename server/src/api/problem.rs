@@ -77,6 +77,9 @@ pub fn entry(error: &Error) -> Entry {
         Error::ForeignSnapshot { .. } => {
             ("FOREIGN_SNAPSHOT", Code::FailedPrecondition, StatusCode::CONFLICT)
         }
+        Error::NothingToShow { .. } => {
+            ("NOTHING_TO_SHOW", Code::FailedPrecondition, StatusCode::CONFLICT)
+        }
         Error::NothingObserved => {
             ("NOTHING_OBSERVED", Code::FailedPrecondition, StatusCode::CONFLICT)
         }
@@ -245,6 +248,7 @@ mod tests {
                 found: "00ff".into(),
                 expected: "which is not served here".into(),
             },
+            Error::NothingToShow { last: 9 },
             Error::NothingObserved,
             Error::OutputUnavailable {
                 field: "outputs.outputs[0]".into(),

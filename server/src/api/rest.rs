@@ -1,9 +1,12 @@
 //! The REST skin: the same messages as JSON, or as protobuf for who prefers it.
 //!
-//! [`body`] reads and writes them; the paths are a file a room: [`models`], [`sessions`], [`rollouts`].
+//! [`body`] reads and writes them; the paths are a file a room: [`models`], [`sessions`], [`rollouts`], and for people
+//! [`pictures`] and [`live`].
 
 pub(super) mod body;
+mod live;
 mod models;
+mod pictures;
 mod rollouts;
 mod sessions;
 
@@ -19,7 +22,7 @@ use axum::{
 use utoipa_swagger_ui::SwaggerUi;
 
 use super::{counted, openapi::DOCUMENT};
-use crate::{error::Error, service::Service};
+use crate::{dashboard, error::Error, service::Service};
 
 type App = State<Arc<Service>>;
 
@@ -42,6 +45,9 @@ pub fn router(service: Arc<Service>) -> Router {
         .route("/v1/predictions", post(rollouts::predict))
         .route("/v1/goals", put(rollouts::put_goal))
         .route("/v1/goals/{id}", delete(rollouts::delete_goal))
+        .merge(pictures::routes())
+        .merge(live::routes())
+        .merge(dashboard::routes())
         // The document itself at /openapi.json, and a page over it that needs nothing from elsewhere.
         .merge(SwaggerUi::new("/docs").external_url_unchecked("/openapi.json", DOCUMENT.clone()))
         .fallback(unknown_path)

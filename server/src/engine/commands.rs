@@ -46,7 +46,8 @@ pub struct Wanted {
     pub outputs: Outputs,
     /// How.
     pub form: Form,
-    /// Which outputs are wanted as 32-bit floats besides, for the spread over samples.
+    /// Which outputs are wanted as 32-bit floats besides: of rollouts for the spread over samples, of observations for
+    /// who watches.
     pub spread: Outputs,
 }
 
@@ -117,6 +118,8 @@ pub struct Observed {
     pub state: Arc<StateRow>,
     /// What was wanted.
     pub values: Vec<Value>,
+    /// What was wanted besides.
+    pub besides: Vec<Value>,
     /// Where time went.
     pub spent: Spent,
 }

@@ -17,6 +17,7 @@ use parking_lot::Mutex;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::{
+    gauges::{Gauges, Waiting},
     models::{Cost, Costs},
     scheduler::Sizes,
 };
@@ -49,6 +50,7 @@ pub(super) struct Door {
     tenants: AtomicU64,
     measured: Mutex<Instant>,
     sizes: Sizes,
+    pub(super) gauges: Gauges,
 }
 
 /// Room for work of one urgency.
@@ -56,6 +58,8 @@ pub(super) struct Door {
 struct Room {
     observes: Arc<Semaphore>,
     rows: Arc<Semaphore>,
+    /// How much room for observes and rows there is when nobody is here.
+    all: [usize; 2],
     /// In KiB, since a semaphore counts no further than 32 bits at once.
     outputs: Arc<Semaphore>,
 }
@@ -83,10 +87,12 @@ pub(super) struct Ticket {
 impl Door {
     pub(super) fn new(door: DoorSizes, sizes: Sizes) -> Self {
         let room = |part: usize| {
-            let semaphore = |permits: usize| Arc::new(Semaphore::new((permits / part).max(1)));
+            let share = |all: usize| (all / part).max(1);
+            let semaphore = |all: usize| Arc::new(Semaphore::new(share(all)));
             Room {
                 observes: semaphore(door.observes),
                 rows: semaphore(door.rows),
+                all: [share(door.observes), share(door.rows)],
                 outputs: semaphore(kib(door.output_bytes) as usize),
             }
         };
@@ -98,7 +104,18 @@ impl Door {
             tenants: AtomicU64::new(0),
             measured: Mutex::new(Instant::now()),
             sizes,
+            gauges: Gauges::default(),
         }
+    }
+
+    /// What is let in and not answered.
+    pub(super) fn waiting(&self) -> Waiting {
+        let taken = |Room { observes, rows, all, .. }: &Room| {
+            [all[0] - observes.available_permits(), all[1] - rows.available_permits()]
+        };
+        let (live, bulk) = (taken(&self.live), taken(&self.bulk));
+        let [observes, rows] = [0, 1].map(|at| (live[at] + bulk[at]) as u64);
+        Waiting { observes, rows, time: nanos(&self.ahead) }
     }
 
     /// Room for an observe that somebody waits for.

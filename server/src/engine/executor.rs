@@ -79,6 +79,7 @@ impl Executor {
     }
 
     fn tick(&mut self) {
+        self.door.gauges.tick();
         let rolling = self.served.values().filter(|served| served.scheduler().is_rolling());
         let time = self.config.tick / (rolling.count().max(1) as u32);
         let ticks: Vec<(ModelId, Tick)> =

@@ -18,6 +18,7 @@ mod batch;
 pub mod commands;
 mod door;
 mod executor;
+mod gauges;
 pub mod models;
 pub mod scheduler;
 mod served;
@@ -42,7 +43,10 @@ use self::{
 };
 use crate::error::Error;
 
-pub use self::door::DoorSizes;
+pub use self::{
+    door::DoorSizes,
+    gauges::{Computed, Reading},
+};
 
 /// Sizes of the engine.
 #[derive(Clone, Copy, Debug)]
@@ -137,6 +141,11 @@ impl Engine {
         Door::bulk_limit(self.config.door)
     }
 
+    /// What it has done so far, and what waits.
+    pub fn reading(&self) -> Reading {
+        self.door.gauges.read(self.door.waiting())
+    }
+
     /// Makes a step with an observation.
     ///
     /// # Errors
@@ -144,9 +153,10 @@ impl Engine {
     pub async fn observe(&self, job: Observe) -> Result<Observed, Error> {
         let costs = &job.model.costs;
         let ticket = match job.urgency {
-            Urgency::Live => self.door.admit_observe(costs, job.deadline)?,
-            Urgency::Bulk => self.door.admit_bulk_observe(costs).await?,
+            Urgency::Live => self.door.admit_observe(costs, job.deadline),
+            Urgency::Bulk => self.door.admit_bulk_observe(costs).await,
         };
+        let ticket = ticket.inspect_err(|_| self.door.gauges.refused())?;
         let (reply, answer) = oneshot::channel();
         let command = Command::Observe(order(job, reply, ticket));
         self.commands.send(command).await.map_err(gone)?;
@@ -161,10 +171,11 @@ impl Engine {
         let (rows, steps) = (job.rows(), job.last_depth());
         let load = Load { rows, steps, output_bytes, deadline: job.deadline };
         let costs = &job.model.costs;
-        let (ticket, outputs) = match job.urgency {
-            Urgency::Live => self.door.admit_rollout(costs, load)?,
-            Urgency::Bulk => self.door.admit_bulk_rollout(costs, load).await?,
+        let admitted = match job.urgency {
+            Urgency::Live => self.door.admit_rollout(costs, load),
+            Urgency::Bulk => self.door.admit_bulk_rollout(costs, load).await,
         };
+        let (ticket, outputs) = admitted.inspect_err(|_| self.door.gauges.refused())?;
         // One chunk per row and depth at most, split no further than by row, and one failure.
         let (reply, chunks) = mpsc::channel(rows as usize * steps as usize + 1);
         let command = Command::Imagine(order(job, reply, ticket));

@@ -139,6 +139,7 @@ impl Served {
         let result = span.in_scope(|| compute(self.world.as_ref(), batch));
         let elapsed = started.elapsed();
         self.metrics.batch(Kind::Observe, rows, block.len(), elapsed);
+        self.door.gauges.block(Kind::Observe, rows, block.len(), elapsed);
         self.measured(Kind::Observe, elapsed);
         let computed = match result {
             Ok(computed) => computed,
@@ -158,6 +159,7 @@ impl Served {
                     computed.rows.as_ref().expect("observing gives rows")[lane].clone(),
                 ),
                 values: computed.row_values(lane, order.job.wanted),
+                besides: computed.spread(lane..lane + 1, order.job.wanted),
                 spent,
             };
             // Who has gone away meanwhile does not get it, and the session does not move.
@@ -187,6 +189,7 @@ impl Served {
         let result = span.in_scope(|| compute(self.world.as_ref(), batch));
         let elapsed = started.elapsed();
         self.metrics.batch(Kind::Imagine, rows, block.len(), elapsed);
+        self.door.gauges.block(Kind::Imagine, rows, block.len(), elapsed);
         self.measured(Kind::Imagine, elapsed);
         let computed = match result {
             Ok(computed) => computed,

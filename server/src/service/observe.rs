@@ -11,15 +11,19 @@ use tokio::time::timeout_at;
 use super::{
     Call, Service, answer, aside,
     fields::{self, Selection, Steps},
+    show,
 };
 use crate::{
     engine::{
-        commands::{Observe, Urgency, Value},
+        commands::{Observe, Urgency, Value, Wanted},
         models::ModelEntry,
     },
     error::Error,
     media::{self, Fitted, Target},
-    sessions::session::{Answer, Position, Seen, Session},
+    sessions::{
+        live::Shown,
+        session::{Answer, Position, Seen, Session},
+    },
     telemetry,
 };
 
@@ -96,6 +100,7 @@ impl Service {
         let image = fitted.as_ref().map_or(image, |fitted| fitted.sent);
         let frame = fitted.map(|fitted| fitted.pixels);
         let seen = Seen { step, frame: frame.clone(), action: action.clone(), image };
+        let wanted = Wanted { spread: Self::besides(session, &model.spec), ..selection.wanted };
         let observed = self
             .engine
             .observe(Observe {
@@ -105,7 +110,7 @@ impl Service {
                 action,
                 noise: draws.noise(step),
                 lane: draws.seed,
-                wanted: selection.wanted,
+                wanted,
                 deadline,
                 urgency: Urgency::Live,
             })
@@ -114,6 +119,7 @@ impl Service {
         if image_skipped {
             telemetry::image_skipped();
         }
+        let besides = observed.besides;
         let began = Instant::now();
         let objects = answer::objects(&observed.values, image, model.spec.preprocess);
         let outputs = self.outputs(observed.values, selection).await?;
@@ -128,8 +134,15 @@ impl Service {
             objects,
             timing: Some(answer::timing(observed.spent, decoding + began.elapsed())),
         };
+        let shown = (!besides.is_empty()).then(|| {
+            let (seen, timing) = (seen.clone(), belief.timing.unwrap_or_default());
+            Arc::new(Shown { image_skipped, ..show::shown(&model.spec, seen, besides, timing) })
+        });
         let position = Position { model, draws, next_step: step + 1, state: observed.state, image };
         session.commit(position, Answer { digest, belief: belief.clone() }, seen);
+        if let Some(shown) = shown {
+            session.live.show(shown);
+        }
         let v1::Timing { queue_micros, compute_micros, encode_micros } =
             belief.timing.unwrap_or_default();
         tracing::debug!(

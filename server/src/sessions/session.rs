@@ -17,6 +17,7 @@ use parking_lot::Mutex;
 use prost::Message as _;
 use tokio::sync::OwnedSemaphorePermit;
 
+use super::live::{Last, Live};
 use crate::{engine::models::ModelEntry, error::Error};
 
 /// 128 random bits, written as 32 hexadecimal digits.
@@ -154,6 +155,8 @@ pub struct History {
     positions: VecDeque<Position>,
     /// What it saw, oldest first.
     seen: VecDeque<Seen>,
+    /// Its newest step, to be shown; absent where the session came to its belief otherwise than by observing.
+    last: Option<Arc<Last>>,
 }
 
 /// The actions that were planned last.
@@ -176,6 +179,8 @@ pub struct Session {
     pub created_at: SystemTime,
     /// Held by whatever moves it: one after the other.
     pub turn: tokio::sync::Mutex<()>,
+    /// Where it is watched.
+    pub live: Live,
     current: Mutex<Current>,
     /// Room for what it keeps.
     _room: OwnedSemaphorePermit,
@@ -204,6 +209,7 @@ impl Session {
             terms,
             created_at: SystemTime::now(),
             turn: tokio::sync::Mutex::new(()),
+            live: Live::default(),
             current: Mutex::new(current),
             _room: room,
         }
@@ -223,6 +229,11 @@ impl Session {
     /// The answer to the last observation.
     pub fn answer(&self) -> Option<Answer> {
         self.current.lock().answer.clone()
+    }
+
+    /// The newest step, if the session came to its belief by observing.
+    pub fn last(&self) -> Option<Arc<Last>> {
+        self.current.lock().history.last.clone()
     }
 
     /// What was planned last.
@@ -245,7 +256,8 @@ impl Session {
         let current = &mut *self.current.lock();
         let before = std::mem::replace(&mut current.position, position);
         current.answer = Some(answer);
-        let History { positions, seen: kept } = &mut current.history;
+        let History { positions, seen: kept, last } = &mut current.history;
+        *last = Some(Arc::new(Last { before: before.clone(), seen: seen.clone() }));
         if before.next_step > 0 {
             keep(positions, before, self.terms.keep_steps);
         }
@@ -262,7 +274,7 @@ impl Session {
         if to_step == last {
             return Ok(());
         }
-        let History { positions, seen } = &mut current.history;
+        let History { positions, seen, last: newest } = &mut current.history;
         let oldest = positions.front().map(|position| position.next_step - 1);
         let at = positions.iter().position(|position| position.next_step == to_step + 1);
         let at = at.ok_or(Error::StepNotKept { to_step, oldest, last })?;
@@ -270,6 +282,7 @@ impl Session {
             current.position = position;
         }
         seen.retain(|seen| seen.step <= to_step);
+        *newest = None;
         current.answer = None;
         Ok(())
     }
@@ -288,6 +301,7 @@ impl Session {
         current.position = position;
         current.answer = None;
         current.history.positions.clear();
+        current.history.last = None;
     }
 
     /// When it was last used.
@@ -307,8 +321,13 @@ impl Session {
     pub fn bytes(&self) -> usize {
         let current = self.current.lock();
         let Current { position, answer, history, planned, .. } = &*current;
-        let rows = 1 + history.positions.len();
-        let frames = history.seen.iter().map(Seen::bytes).sum::<usize>();
+        // What the newest step came from is kept once, whether or not it is also kept to return to or to replay.
+        let last = history.last.as_ref();
+        let rows = 1 + history.positions.len().max(last.iter().len());
+        let frames = match (last, history.seen.is_empty()) {
+            (Some(last), true) => last.seen.bytes(),
+            _ => history.seen.iter().map(Seen::bytes).sum(),
+        };
         let answer = answer.as_ref().map_or(0, |answer| answer.belief.encoded_len());
         let planned = planned.as_ref().map_or(0, |planned| size_of_val(&*planned.actions));
         rows * position.model.row_bytes + frames + answer + planned
