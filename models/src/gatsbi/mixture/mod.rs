@@ -21,6 +21,7 @@ use self::{
 };
 use crate::{
     config::MixtureConfig,
+    kernels,
     nn::{LearnedState, LstmBank, Normal, Path},
     noise::{Noise, Site},
 };
@@ -224,6 +225,8 @@ impl Mixture {
 
     /// Makes the exact inference forms; gradients must be off from here on.
     pub fn freeze(&mut self) {
+        self.encoder.freeze();
+        self.mask_decoder.freeze();
         self.comps.freeze();
         self.comp_decoder.freeze();
     }
@@ -260,7 +263,7 @@ impl Mixture {
         train: bool,
     ) -> (MixtureState, MixtureStep) {
         let components = self.comp_decoder.forward(&comps.z, action, train);
-        let mu_mix = (log_masks.exp() * &components).sum_dim_intlist(1, false, Kind::Float);
+        let mu_mix = mix(&log_masks, &components);
         let encoding = self.encoder.forward(&mu_mix).unsqueeze(1); // [B, 1, e]
         let encodings = encoding.expand([-1, masks.z.size()[1], -1], false);
         let inputs = |z: &Tensor| Tensor::cat(&[z, &encodings], -1);
@@ -296,6 +299,17 @@ impl Mixture {
         };
         (next, step)
     }
+}
+
+/// `mu_mix = Σ_k π_k o_k`.
+///
+/// # Shapes
+/// Log masks `[B, K, 1, H, W]` and images `[B, K, 3, H, W]`; returns `[B, 3, H, W]`.
+fn mix(log_masks: &Tensor, components: &Tensor) -> Tensor {
+    if kernels::serve(&[log_masks, components]) {
+        return kernels::mix(log_masks, components);
+    }
+    (log_masks.exp() * components).sum_dim_intlist(1, false, Kind::Float)
 }
 
 /// `[B, K, width]` of a state's slots.

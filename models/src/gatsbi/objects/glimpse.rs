@@ -4,6 +4,7 @@ use tch::Tensor;
 
 use crate::{
     config::ObjectConfig,
+    kernels::{Layer, Stack},
     nn::{Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Linear, Path},
 };
 
@@ -12,6 +13,8 @@ use crate::{
 pub(crate) struct GlimpseEncoder {
     convs: Vec<(Conv2d, GroupNorm)>,
     output: Linear,
+    side: i64,
+    frozen: Option<Stack>,
 }
 
 impl GlimpseEncoder {
@@ -33,17 +36,27 @@ impl GlimpseEncoder {
             config.hidden,
             InitScheme::Framework,
         );
-        Self { convs, output }
+        Self { convs, output, side: config.glimpse, frozen: None }
     }
 
     /// # Shapes
     /// `[B, N, 3, s, s]`; returns `[B, N, hidden]`.
     pub(crate) fn forward(&self, glimpses: &Tensor) -> Tensor {
         let (batch, count) = (glimpses.size()[0], glimpses.size()[1]);
-        let features = self.convs.iter().fold(glimpses.flatten(0, 1), |x, (conv, norm)| {
-            norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
-        });
+        let glimpses = glimpses.flatten(0, 1);
+        let features = match &self.frozen {
+            Some(stack) => stack.forward(&glimpses),
+            None => self.convs.iter().fold(glimpses, |x, (conv, norm)| {
+                norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
+            }),
+        };
         self.output.forward(&features.flatten(1, -1)).view([batch, count, -1])
+    }
+
+    pub(crate) fn freeze(&mut self) {
+        let layers = self.convs.iter();
+        let layers = layers.map(|(conv, norm)| Layer::Conv(conv.kernel(), norm.after_celu()));
+        self.frozen = Stack::for_cpu(layers.collect(), self.side, &self.output.weight);
     }
 }
 

@@ -125,6 +125,10 @@ impl Propagation {
         next.join()
     }
 
+    pub(crate) fn freeze(&mut self) {
+        self.proposal_encoder.freeze();
+    }
+
     /// The prior of the dynamics latents given the prior memory.
     pub(crate) fn dynamics_prior(&self, h_prior: &Tensor) -> Normal {
         Normal::from_head(&self.dyna_prior.forward(h_prior))

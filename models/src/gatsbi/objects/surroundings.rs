@@ -86,6 +86,10 @@ impl Surroundings {
         }
     }
 
+    pub(crate) fn freeze(&mut self) {
+        self.encoder.freeze();
+    }
+
     /// The crop of `mu_mix [B, 3, H, W]` around objects at `z_where [B, N, 4]`, `[B, N, 3, s, s]`.
     pub(crate) fn crop(&self, mu_mix: &Tensor, z_where: &Tensor) -> Tensor {
         let scale = z_where.narrow(-1, 0, 2) + self.margin;
