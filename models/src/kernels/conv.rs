@@ -111,7 +111,8 @@ impl Conv {
         let side = self.side(from.side);
         if side < images.min(FEW) {
             // A tile's pixels are then those of neighbouring images.
-            let turn = |at: Strides| Strides { image: at.row, row: at.pixel, pixel: at.image, ..at };
+            let turn =
+                |at: Strides| Strides { image: at.row, row: at.pixel, pixel: at.image, ..at };
             let (from, to) = ((input, from.row(), turn(strides)), (output, turn(to)));
             self.run(side, (side, images), from, to);
         } else {

@@ -33,7 +33,8 @@ pub(crate) fn crop(image: &Tensor, z_where: &Tensor, side: i64) -> Tensor {
                 let high = &plane[row.high * width..][..width];
                 for (column, x) in columns.iter().zip(out) {
                     let line = |line: &[f32]| {
-                        line[column.low] * column.low_weight + line[column.high] * column.high_weight
+                        line[column.low] * column.low_weight
+                            + line[column.high] * column.high_weight
                     };
                     *x = line(low) * row.low_weight + line(high) * row.high_weight;
                 }
@@ -90,7 +91,7 @@ mod tests {
             [0.1, 0.1, -1.0, 1.0],
         ];
         let boxes = Tensor::from_slice(&boxes.concat()).view([2, 3, 4]);
-        let plain = crate::nn::spatial_transformer::plain_crop(&image, &boxes, 16);
+        let plain = crate::nn::spatial_transformer::crop(&image, &boxes, 16);
         let difference = (crop(&image, &boxes, 16) - plain).abs().max().double_value(&[]);
         assert!(difference < 1e-4, "{difference}");
     }

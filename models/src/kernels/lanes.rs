@@ -64,8 +64,8 @@ impl Lanes for Plain {
     #[inline(always)]
     fn multiply_add(a: [f32; 8], b: [f32; 8], c: [f32; 8]) -> [f32; 8] {
         let mut sum = c;
-        for lane in 0..8 {
-            sum[lane] = Self::fused(a[lane], b[lane], c[lane]);
+        for ((sum, a), b) in sum.iter_mut().zip(a).zip(b) {
+            *sum = Self::fused(a, b, *sum);
         }
         sum
     }
@@ -140,11 +140,16 @@ mod x86 {
             }
         };
     }
+    lanes!(Avx2, __m256, 8, 6, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps);
     lanes!(
-        Avx2, __m256, 8, 6, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps
-    );
-    lanes!(
-        Avx512, __m512, 16, 12, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps
+        Avx512,
+        __m512,
+        16,
+        12,
+        _mm512_set1_ps,
+        _mm512_loadu_ps,
+        _mm512_storeu_ps,
+        _mm512_fmadd_ps
     );
 }
 
@@ -195,8 +200,10 @@ pub(super) fn level() -> Level {
 macro_rules! versions {
     ($(#[$doc:meta])* $visibility:vis fn $name:ident($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? = $body:ident) => {
         $(#[$doc])*
-        #[expect(unsafe_code, reason = "functions for processors that have certain instructions")]
-        #[expect(clippy::too_many_arguments, reason = "see the generic function")]
+        #[cfg_attr(
+            target_arch = "x86_64",
+            expect(unsafe_code, reason = "functions for processors that have certain instructions")
+        )]
         $visibility fn $name($($argument: $type),*) $(-> $result)? {
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma")]

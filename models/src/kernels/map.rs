@@ -175,12 +175,7 @@ fn bend_and_measure_in<L: Lanes>(
         bend_row::<L>(row, curve);
         sums.fill(0.0);
         squares.fill(0.0);
-        for pixel in row.chunks_exact(channels) {
-            for ((x, sum), square) in pixel.iter().zip(&mut *sums).zip(&mut *squares) {
-                *sum += x;
-                *square = L::fused(*x, *x, *square);
-            }
-        }
+        measure_row::<L>(row, sums, squares);
         let parts = sums.chunks_exact(width).zip(squares.chunks_exact(width));
         for ([total, total_square], (sums, squares)) in totals.iter_mut().zip(parts) {
             for (sum, square) in sums.iter().zip(squares) {
@@ -199,6 +194,49 @@ fn bend_and_measure_in<L: Lanes>(
             sums[channel] = factor as f32;
             squares[channel] = (f64::from(norm.bias[channel]) - mean * factor) as f32;
         }
+    }
+}
+
+/// Numbers whose sums are kept in registers.
+const BLOCK: usize = 32;
+
+/// Adds each channel of a row's pixels, and its square, to `sums` and `squares`.
+#[inline(always)]
+fn measure_row<L: Lanes>(row: &[f32], sums: &mut [f32], squares: &mut [f32]) {
+    let channels = sums.len();
+    if BLOCK.is_multiple_of(channels) && row.len().is_multiple_of(BLOCK) {
+        let (mut sum, mut square) = ([0.0; BLOCK], [0.0; BLOCK]);
+        for pixels in row.chunks_exact(BLOCK) {
+            add_block::<L>(pixels, &mut sum, &mut square);
+        }
+        for i in 0..BLOCK {
+            sums[i % channels] += sum[i];
+            squares[i % channels] += square[i];
+        }
+    } else if channels.is_multiple_of(BLOCK) {
+        for first in (0..channels).step_by(BLOCK) {
+            let (mut sum, mut square) = ([0.0; BLOCK], [0.0; BLOCK]);
+            for pixel in row.chunks_exact(channels) {
+                add_block::<L>(&pixel[first..first + BLOCK], &mut sum, &mut square);
+            }
+            sums[first..first + BLOCK].copy_from_slice(&sum);
+            squares[first..first + BLOCK].copy_from_slice(&square);
+        }
+    } else {
+        for pixel in row.chunks_exact(channels) {
+            for ((x, sum), square) in pixel.iter().zip(&mut *sums).zip(&mut *squares) {
+                *sum += x;
+                *square = L::fused(*x, *x, *square);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn add_block<L: Lanes>(numbers: &[f32], sum: &mut [f32; BLOCK], square: &mut [f32; BLOCK]) {
+    for ((x, sum), square) in numbers.iter().zip(sum).zip(square) {
+        *sum += x;
+        *square = L::fused(*x, *x, *square);
     }
 }
 

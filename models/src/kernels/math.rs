@@ -11,7 +11,7 @@ pub(super) fn exp_negative<L: Lanes>(x: f32) -> f32 {
     let shifted = L::fused(x, std::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
     // ln 2 in two parts, so that the remainder is exact.
-    let r = L::fused(n, 1.428_606_8e-6, L::fused(n, -0.693_145_75, x));
+    let r = L::fused(n, -1.428_606_8e-6, L::fused(n, -0.693_145_75, x));
     // Cephes' polynomial for (e^r - 1 - r) / r².
     let p = L::fused(1.987_569_1e-4, r, 1.398_2e-3);
     let p = L::fused(p, r, 8.333_452e-3);

@@ -9,6 +9,11 @@
 //! Images do not touch each other, all products are fused and sums have a fixed order, so an image's numbers are the
 //! same bytes whatever is computed beside it. What these kernels do not do: gradients, other devices, other number types.
 
+#![expect(
+    clippy::inline_always,
+    reason = "what is not inlined lacks the instructions of its caller"
+)]
+
 mod conv;
 mod glimpses;
 mod lanes;
@@ -19,16 +24,8 @@ mod parallel;
 mod stack;
 mod tensor;
 
-use tch::{Device, Kind, Tensor};
-
 pub(crate) use conv::Conv;
 pub(crate) use glimpses::crop;
 pub(crate) use map::{After, Curve, Groups};
 pub(crate) use mixing::{break_sticks, enlarge_to, mix};
 pub(crate) use stack::{Layer, Stack};
-
-/// Whether the kernels can compute with these: on the CPU, in single precision, and nobody wants gradients.
-pub(crate) fn serve(inputs: &[&Tensor]) -> bool {
-    let fits = |x: &&Tensor| x.device() == Device::Cpu && x.kind() == Kind::Float;
-    inputs.iter().all(|x| fits(x) && !x.requires_grad())
-}

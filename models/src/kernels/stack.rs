@@ -49,7 +49,12 @@ pub(crate) enum Layer {
 
 impl Layer {
     /// From `weight [out * factor², in, 1, 1]` and its bias, with channels in the order of a pixel shuffle.
-    pub(crate) fn enlarge(weight: &Tensor, bias: Option<&Tensor>, factor: i64, after: After) -> Self {
+    pub(crate) fn enlarge(
+        weight: &Tensor,
+        bias: Option<&Tensor>,
+        factor: i64,
+        after: After,
+    ) -> Self {
         let parts = (0..factor * factor).map(|part| {
             let pick = |x: &Tensor| x.unflatten(0, [-1, factor * factor]).select(1, part);
             Conv::new(&pick(weight), bias.map(pick).as_ref(), 1, 0)
@@ -93,7 +98,9 @@ impl Layer {
     fn is_heavy(&self) -> bool {
         match self {
             Self::Conv(conv, _) => conv.is_heavy(),
-            Self::Enlarge { parts, .. } => parts.len() * parts[0].outputs * parts[0].inputs > 1 << 16,
+            Self::Enlarge { parts, .. } => {
+                parts.len() * parts[0].outputs * parts[0].inputs > 1 << 16
+            }
             Self::Spread { .. } => false,
             Self::Residual { second, .. } => second.is_heavy(),
         }
@@ -120,7 +127,13 @@ impl Layer {
         }
     }
 
-    fn apply(&self, images: usize, (input, from): (&[f32], Shape), (output, to): (&mut [f32], Shape), room: &mut [f32]) {
+    fn apply(
+        &self,
+        images: usize,
+        (input, from): (&[f32], Shape),
+        (output, to): (&mut [f32], Shape),
+        room: &mut [f32],
+    ) {
         let each = |output: &mut [f32], after: &After| {
             for image in output.chunks_exact_mut(to.floats()).take(images) {
                 after.apply(image, to);
@@ -142,7 +155,9 @@ impl Layer {
             }
             Self::Spread { map, .. } => {
                 let vectors = input.chunks_exact(from.floats());
-                for (image, vector) in output.chunks_exact_mut(to.floats()).zip(vectors).take(images) {
+                for (image, vector) in
+                    output.chunks_exact_mut(to.floats()).zip(vectors).take(images)
+                {
                     spread(map, vector, image, to);
                 }
             }
@@ -163,7 +178,8 @@ impl Layer {
                     None => (input, from),
                 };
                 let others = other.chunks_exact(shape.floats());
-                for (image, other) in output.chunks_exact_mut(to.floats()).zip(others).take(images) {
+                for (image, other) in output.chunks_exact_mut(to.floats()).zip(others).take(images)
+                {
                     add_and_rectify(image, to, other, shape);
                 }
             }
@@ -220,7 +236,9 @@ impl Stack {
             macs += layer.macs(side);
             (side, channels) = layer.output(side, channels);
             match runs.last_mut() {
-                Some(std::ops::Range { end, .. }) if !layer.is_heavy() && !after_heavy => *end = i + 1,
+                Some(std::ops::Range { end, .. }) if !layer.is_heavy() && !after_heavy => {
+                    *end = i + 1
+                }
                 _ => runs.push(i..i + 1),
             }
             after_heavy = layer.is_heavy();
@@ -258,7 +276,8 @@ impl Stack {
         let joint = |at: usize| {
             let heavy = |run: &std::ops::Range<usize>| self.layers[run.start].is_heavy();
             let inner = |(i, run): (usize, &std::ops::Range<usize>)| {
-                run.start == at && (i > 0 || heavy(run)) || run.end == at && (i < last || heavy(run))
+                run.start == at && (i > 0 || heavy(run))
+                    || run.end == at && (i < last || heavy(run))
             };
             self.runs.iter().enumerate().any(inner)
         };
@@ -299,7 +318,12 @@ impl Stack {
                     let (output, to) = (&mut after[0], self.shapes[at + 1]);
                     let (read, write) = (place(input, from), place(output, to));
                     let (input, output) = (&input[read..], &mut output[write..]);
-                    self.layers[at].apply(together, (input, from), (output, to), &mut rooms.within[at]);
+                    self.layers[at].apply(
+                        together,
+                        (input, from),
+                        (output, to),
+                        &mut rooms.within[at],
+                    );
                 }
                 if run.end == end {
                     let (shape, room) = (self.shapes[end], &rooms.images[end]);

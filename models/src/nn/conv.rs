@@ -246,7 +246,12 @@ impl SubPixelConv {
     /// The same for a CPU, if it has a norm.
     pub(crate) fn kernel(&self) -> Option<kernels::Layer> {
         let after = self.norm.as_ref()?.after_celu();
-        Some(kernels::Layer::enlarge(&self.conv.weight, self.conv.bias.as_ref(), self.factor, after))
+        Some(kernels::Layer::enlarge(
+            &self.conv.weight,
+            self.conv.bias.as_ref(),
+            self.factor,
+            after,
+        ))
     }
 
     pub(crate) fn forward(&self, x: &Tensor) -> Tensor {

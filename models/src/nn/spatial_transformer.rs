@@ -5,8 +5,6 @@
 
 use tch::{Kind, Tensor};
 
-use crate::kernels;
-
 /// Keeps the inverse transform of an empty box finite.
 const EPS: f64 = 1e-9;
 
@@ -15,14 +13,6 @@ const EPS: f64 = 1e-9;
 /// # Shapes
 /// `image [B, C, H, W]`, `z_where [B, N, 4]`; returns `[B, N, C, side, side]`.
 pub(crate) fn crop(image: &Tensor, z_where: &Tensor, side: i64) -> Tensor {
-    if kernels::serve(&[image, z_where]) {
-        return kernels::crop(image, z_where, side);
-    }
-    plain_crop(image, z_where, side)
-}
-
-/// [`crop`] by libtorch, on any device and with gradients.
-pub(crate) fn plain_crop(image: &Tensor, z_where: &Tensor, side: i64) -> Tensor {
     let (b, c, h, w) = image.size4().expect("an image batch has four axes");
     let n = z_where.size()[1];
     let boxes = z_where.reshape([b * n, 4]);

@@ -193,6 +193,7 @@ impl CompEncoder {
         }
         let layer = |layer: &ConvNorm| Some(Layer::Conv(layer.kernel()?, After::only(Curve::Elu)));
         let layers: Option<Vec<Layer>> = self.convs.iter().map(layer).collect();
-        self.frozen = layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.output.weight));
+        self.frozen =
+            layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.output.weight));
     }
 }

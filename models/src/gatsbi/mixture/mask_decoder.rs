@@ -153,9 +153,6 @@ impl MaskDecoder {
 /// # Shapes
 /// `logits [B, K-1, 1, H, W]`; returns `[B, K, 1, H, W]`.
 pub(crate) fn stick_breaking(logits: &Tensor) -> Tensor {
-    if kernels::serve(&[logits]) {
-        return kernels::break_sticks(logits);
-    }
     let taken = logits.log_sigmoid();
     let left = (-logits).log_sigmoid().cumsum(1, tch::Kind::Float); // scope after slot k
     let ones = left.narrow(1, 0, 1).zeros_like();

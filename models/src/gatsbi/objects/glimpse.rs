@@ -4,8 +4,11 @@ use tch::Tensor;
 
 use crate::{
     config::ObjectConfig,
-    kernels::{Layer, Stack},
-    nn::{Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Linear, Path},
+    kernels::{self, Layer, Stack},
+    nn::{
+        Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Linear, Path,
+        spatial_transformer::crop,
+    },
 };
 
 /// Glimpses `[N, 3, s, s]` to features: halving convolutions with CELU and group norm, then a linear layer.
@@ -37,6 +40,17 @@ impl GlimpseEncoder {
             InitScheme::Framework,
         );
         Self { convs, output, side: config.glimpse, frozen: None }
+    }
+
+    /// Cuts the glimpses that it encodes out of images.
+    ///
+    /// # Shapes
+    /// `image [B, 3, H, W]`, `z_where [B, N, 4]`; returns `[B, N, 3, s, s]`.
+    pub(crate) fn crop(&self, image: &Tensor, z_where: &Tensor) -> Tensor {
+        match &self.frozen {
+            Some(_) => kernels::crop(image, z_where, self.side),
+            None => crop(image, z_where, self.side),
+        }
     }
 
     /// # Shapes

@@ -68,7 +68,8 @@ impl ImageEncoder {
         let blocks = self.blocks.iter().map(BasicBlock::layer);
         let layers = std::iter::once(stem).chain(blocks).chain([Some(last)]).collect();
         let layers: Option<Vec<Layer>> = layers;
-        self.frozen = layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.last.weight));
+        self.frozen =
+            layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.last.weight));
     }
 }
 
@@ -117,7 +118,11 @@ impl BasicBlock {
             Some(shortcut) => Some(shortcut.kernel()?),
             None => None,
         };
-        Some(Layer::Residual { first: self.first.kernel()?, second: self.second.kernel()?, shortcut })
+        Some(Layer::Residual {
+            first: self.first.kernel()?,
+            second: self.second.kernel()?,
+            shortcut,
+        })
     }
 
     fn freeze(&mut self) {
