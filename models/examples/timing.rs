@@ -2,9 +2,10 @@
 //!
 //! It takes turns with the model's twin (`tests/reference/gatsbi_twin/timing.py`), so it works only when it is told to:
 //! each line `CHECKPOINT BATCH STEP SECONDS` on standard input has a step (`observe` or `imagine`) repeated for so long,
-//! at least once, and is answered by how often it was made; whoever asks looks at the processor time meanwhile. Steps
-//! are those that a server makes: packed state, actions in raw units, counter-based noise, new objects looked for in
-//! every frame, nothing drawn.
+//! at least once, and is answered by how often it was made, the multiply-accumulates of one, and the bytes of a row's
+//! state; whoever asks looks at the processor time meanwhile. Steps are those that a server makes: packed state, actions
+//! in raw units, counter-based noise, new objects looked for in every frame, nothing drawn. The step `multiply` is a
+//! product of square matrices, as fast as libtorch makes one: what the processor can do.
 
 #![expect(clippy::print_stdout, reason = "answers go to standard output")]
 
@@ -17,12 +18,16 @@ use std::{
 
 use gatsbi_models::{
     gatsbi::world::GatsbiWorld,
+    nn::count_macs,
     noise::{PhiloxNoise, RowNoise},
     scene::Outputs,
     state::State,
     world_model::WorldModel,
 };
 use tch::{Device, Kind, Tensor};
+
+/// Rows of the matrices that are multiplied: large enough for full speed, small enough for a turn.
+const SIDE: u64 = 1024;
 
 /// A batch of a model in the midst of its scenes.
 struct Batch {
@@ -37,6 +42,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     tch::set_num_threads(1);
     tch::set_num_interop_threads(1);
     let mut batches = HashMap::new();
+    let square = Tensor::rand([SIDE as i64; 2], (Kind::Float, Device::Cpu));
     for line in std::io::stdin().lines() {
         let line = line?;
         let &[checkpoint, rows, step, seconds] = &line.split(' ').collect::<Vec<_>>()[..] else {
@@ -49,12 +55,16 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         let batch = &batches[&key];
         let time = Duration::from_secs_f64(seconds.parse()?);
-        let made = match step {
+        let (made, macs) = match step {
             "observe" => repeat(time, || batch.observe()),
             "imagine" => repeat(time, || batch.imagine()),
-            _ => return Err(format!("{step:?} is neither observe nor imagine").into()),
+            "multiply" => {
+                let (made, _) = repeat(time, || square.matmul(&square));
+                (made, SIDE.pow(3))
+            }
+            _ => return Err(format!("{step:?} is not observe, imagine or multiply").into()),
         };
-        println!("{made}");
+        println!("{made} {macs} {}", batch.world.layout().row_bytes());
     }
     Ok(())
 }
@@ -88,12 +98,12 @@ impl Batch {
     }
 }
 
-/// Makes a step as often as there is time for, at least once; returns how often.
-fn repeat(time: Duration, step: impl Fn() -> State) -> u32 {
-    let (began, mut made) = (Instant::now(), 0);
+/// Makes a step as often as there is time for, at least once; returns how often, and the multiply-accumulates of one.
+fn repeat<T>(time: Duration, step: impl Fn() -> T) -> (u32, u64) {
+    let (began, mut made, mut macs) = (Instant::now(), 0, 0);
     while made == 0 || began.elapsed() < time {
-        drop(step());
+        (_, macs) = count_macs(&step);
         made += 1;
     }
-    made
+    (made, macs)
 }

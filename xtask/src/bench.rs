@@ -4,6 +4,9 @@
 //! caches down, so the sides take turns at every step in every round, and the result is the median over the rounds of the
 //! ratio within a round. The twin runs eagerly, in both memory formats, and the faster one counts. What a step is, is
 //! said in `models/examples/timing.rs` and `tests/reference/gatsbi_twin/timing.py`.
+//! `figures` has the names and the sums of what is reported; `docs/performance.md` says what was learned from it.
+
+mod figures;
 
 use std::fmt;
 use std::io::{BufRead as _, BufReader, IsTerminal as _, Write as _, stderr};
@@ -22,11 +25,14 @@ use crate::process::{Interrupt, Running};
 use crate::{setup, twin};
 
 const PRESETS: [&str; 2] = ["tiny", "push1"];
-const BATCHES: [usize; 3] = [1, 8, 64];
+const BATCHES: [usize; 4] = [1, 8, 64, 256];
 const STEPS: [&str; 2] = ["observe", "imagine"];
 
 /// The twin's memory formats, in the order of its sides.
 const FORMATS: [&str; 2] = ["channels-last", "contiguous"];
+
+/// Rows whose cost shows whether a large batch costs more than its parts.
+const MANY: usize = 512;
 
 /// For programs to end in.
 const GRACE: Duration = Duration::from_secs(10);
@@ -36,9 +42,15 @@ pub(crate) struct Arguments {
     /// Write all numbers to this file
     #[arg(long, value_name = "OUT")]
     json: Option<PathBuf>,
-    /// Three short rounds instead of nine, and no batches of 64
+    /// Short turns, and no batches beyond 8
     #[arg(long)]
     quick: bool,
+    /// Rounds
+    #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
+    rounds: u32,
+    /// Measure the dev profile, in which only the model is optimised: spares compiling libtorch's bindings once more
+    #[arg(long)]
+    dev: bool,
 }
 
 /// A program that makes steps when it is told to.
@@ -63,6 +75,29 @@ struct Round {
     rust: f64,
     /// In each of [`FORMATS`].
     twin: [f64; 2],
+    /// Measured beside 64 imagined rows.
+    beside: Option<Beside>,
+}
+
+/// What else a round of 64 imagined rows measures.
+#[derive(Clone, Copy)]
+struct Beside {
+    /// Seconds of processor time of [`MANY`] imagined rows.
+    many: f64,
+    /// Multiply-accumulates a second of a product of matrices.
+    multiply: f64,
+    /// Multiply-accumulates of the 64 rows.
+    macs: f64,
+    /// Bytes of a session's state.
+    state: f64,
+}
+
+/// What a program answered.
+struct Measured {
+    /// Processor time of a step.
+    seconds: f64,
+    /// What the answer says besides how many steps were made.
+    said: Vec<f64>,
 }
 
 /// Measures, prints a table, writes the file.
@@ -70,8 +105,14 @@ pub(crate) fn bench(root: &Path, arguments: &Arguments) -> Result<()> {
     setup::ensure_set_up(root)?;
     let python = twin::python(root)?;
     let trainer = cargo::build(root, "build --workspace --locked --bin gatsbi-train")?;
-    let timing =
-        cargo::build(root, "build --release --locked --package gatsbi-models --example timing")?;
+    let timing = cargo::build(
+        root,
+        if arguments.dev {
+            "build --workspace --locked --example timing"
+        } else {
+            "build --release --locked --package gatsbi-models --example timing"
+        },
+    )?;
     let interrupt = Interrupt::watch()?;
 
     let folder = tempfile::tempdir()?;
@@ -90,8 +131,9 @@ pub(crate) fn bench(root: &Path, arguments: &Arguments) -> Result<()> {
     let mut channels_last = Side::start("the twin", &mut twin())?;
     let mut contiguous = Side::start("the twin", twin().arg("--contiguous"))?;
 
-    let (rounds, seconds, batches) =
-        if arguments.quick { (3, 0.1, &BATCHES[..2]) } else { (9, 0.5, &BATCHES[..]) };
+    let rounds = arguments.rounds;
+    let (seconds, batches) =
+        if arguments.quick { (0.1, &BATCHES[..2]) } else { (0.5, &BATCHES[..]) };
     let mut lines = lines(batches);
     for round in 0..=rounds {
         for line in &mut lines {
@@ -100,20 +142,42 @@ pub(crate) fn bench(root: &Path, arguments: &Arguments) -> Result<()> {
             let Line { batch, step, .. } = *line;
             let time = if round == 0 { 0.0 } else { seconds };
             let request = format!("{} {batch} {step} {time}", file(line.preset).display());
-            let measured = Round {
-                rust: rust.measure(&request)?,
-                twin: [channels_last.measure(&request)?, contiguous.measure(&request)?],
+            let ours = rust.measure(&request)?;
+            let beside = if batch == 64 && step == "imagine" {
+                let mut also = |batch: usize, step: &str| {
+                    rust.measure(&format!("{} {batch} {step} {time}", file(line.preset).display()))
+                };
+                let (many, multiply) = (also(MANY, "imagine")?, also(1, "multiply")?);
+                Some(Beside {
+                    many: many.seconds,
+                    multiply: multiply.said[0] / multiply.seconds,
+                    macs: ours.said[0],
+                    state: ours.said[1],
+                })
+            } else {
+                None
             };
+            let twin = [channels_last.measure(&request)?, contiguous.measure(&request)?];
+            let twin = twin.map(|twin| twin.seconds);
+            let measured = Round { rust: ours.seconds, twin, beside };
             // The first has loaded the model and made the batch.
             line.rounds.extend((round > 0).then_some(measured));
         }
     }
     progress("");
     print(&lines, rounds);
+    let figures = figures::figures(&lines);
+    figures::print(&figures);
     if let Some(path) = &arguments.json {
         let lines: Vec<_> = lines.iter().map(Line::record).collect();
-        let record =
-            json!({ "torch": VERSION, "threads": 1, "processor": processor(), "steps": lines });
+        let record = json!({
+            "torch": VERSION,
+            "threads": 1,
+            "processor": processor(),
+            "profile": if arguments.dev { "dev" } else { "release" },
+            "figures": figures,
+            "steps": lines,
+        });
         fs::write(path, format!("{record:#}\n"))?;
     }
     Ok(())
@@ -129,16 +193,17 @@ impl Side {
     }
 
     /// Processor time of a step in seconds, as a mean over those that it can make in its turn.
-    fn measure(&mut self, request: &str) -> Result<f64> {
+    fn measure(&mut self, request: &str) -> Result<Measured> {
         let before = self.processor_time()?;
         let mut answer = String::new();
         writeln!(self.input, "{request}")
             .and_then(|()| self.output.read_line(&mut answer))
             .with_context(|| format!("{} does not answer", self.name))?;
         ensure!(!answer.is_empty(), "{} ended", self.name);
-        let made: u32 =
-            answer.trim().parse().with_context(|| format!("{} answered {answer:?}", self.name))?;
-        Ok((self.processor_time()? - before) / f64::from(made))
+        let numbers = answer.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>();
+        let numbers = numbers.with_context(|| format!("{} answered {answer:?}", self.name))?;
+        let (made, said) = numbers.split_first().context("an answer begins with a number")?;
+        Ok(Measured { seconds: (self.processor_time()? - before) / made, said: said.to_vec() })
     }
 
     /// What its threads have used so far, in seconds.
@@ -204,14 +269,16 @@ fn lines(batches: &[usize]) -> Vec<Line> {
     let mut lines = Vec::new();
     for preset in PRESETS {
         for &batch in batches {
-            lines.extend(STEPS.map(|step| Line { preset, batch, step, rounds: Vec::new() }));
+            // Nobody observes hundreds of sessions at once.
+            let steps = STEPS.into_iter().filter(|step| batch <= 64 || *step == "imagine");
+            lines.extend(steps.map(|step| Line { preset, batch, step, rounds: Vec::new() }));
         }
     }
     lines
 }
 
 #[expect(clippy::print_stdout, reason = "the table is what one runs it to see")]
-fn print(lines: &[Line], rounds: usize) {
+fn print(lines: &[Line], rounds: u32) {
     println!(
         "milliseconds of processor time of a step on {}\n\
          medians of {rounds} rounds, of which half lie in the range",
@@ -259,7 +326,10 @@ mod tests {
     #[test]
     fn noise_that_hits_both_sides_leaves_the_ratio() {
         let mut line = lines(&[1]).remove(0);
-        let round = |noise: f64| Round { rust: 2.0 * noise, twin: [7.0 * noise, 5.0 * noise] };
+        let round = |noise: f64| {
+            let twin = [7.0 * noise, 5.0 * noise];
+            Round { rust: 2.0 * noise, twin, beside: None }
+        };
         line.rounds = [1.0, 3.0, 1.5].map(round).into();
         assert_eq!(FORMATS[line.format()], "contiguous");
         assert!(line.ratio().iter().all(|ratio| (ratio - 2.5).abs() < 1e-12));

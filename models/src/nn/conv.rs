@@ -6,6 +6,7 @@ use super::{
     Activation, Path, linear, macs,
     params::{Init, InitScheme},
 };
+use crate::kernels;
 
 /// Epsilon of every normalisation layer.
 const EPS: f64 = 1e-5;
@@ -84,6 +85,11 @@ impl Conv2d {
         linear(x, &self.weight.select(3, 1).select(2, 1), self.bias.as_ref())
     }
 
+    /// The same for a CPU, with its weights of this moment.
+    pub(crate) fn kernel(&self) -> kernels::Conv {
+        kernels::Conv::new(&self.weight, self.bias.as_ref(), self.stride, self.padding)
+    }
+
     fn forward_with(&self, x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Tensor {
         let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
         let y = x.conv2d(weight, bias, stride, padding, [1, 1], 1);
@@ -107,6 +113,12 @@ impl GroupNorm {
             bias: path.weight("bias", &[channels], Init::Constant(0.0)),
             groups,
         }
+    }
+
+    /// What follows a convolution: CELU, then this.
+    pub(crate) fn after_celu(&self) -> kernels::After {
+        let norm = kernels::Groups::new(self.groups, &self.weight, &self.bias);
+        kernels::After { curve: kernels::Curve::Elu, norm: Some(norm) }
     }
 
     pub(crate) fn forward(&self, x: &Tensor) -> Tensor {
@@ -195,6 +207,13 @@ impl ConvNorm {
         }
     }
 
+    /// The same for a CPU, if the norm is folded.
+    pub(crate) fn kernel(&self) -> Option<kernels::Conv> {
+        let (weight, bias) = self.folded.as_ref()?;
+        let Conv2d { stride, padding, .. } = self.conv;
+        Some(kernels::Conv::new(weight, Some(bias), stride, padding))
+    }
+
     /// Folds a batch norm into the convolution, with the running statistics of this moment.
     pub(crate) fn freeze(&mut self) {
         if let Norm::Batch(norm) = &self.norm {
@@ -222,6 +241,17 @@ pub(crate) struct SubPixelConv {
 impl SubPixelConv {
     pub(crate) fn new(conv: Conv2d, norm: Option<GroupNorm>, factor: i64) -> Self {
         Self { conv, norm, factor }
+    }
+
+    /// The same for a CPU, if it has a norm.
+    pub(crate) fn kernel(&self) -> Option<kernels::Layer> {
+        let after = self.norm.as_ref()?.after_celu();
+        Some(kernels::Layer::enlarge(
+            &self.conv.weight,
+            self.conv.bias.as_ref(),
+            self.factor,
+            after,
+        ))
     }
 
     pub(crate) fn forward(&self, x: &Tensor) -> Tensor {

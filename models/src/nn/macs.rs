@@ -15,6 +15,6 @@ pub fn count_macs<T>(compute: impl FnOnce() -> T) -> (T, u64) {
     (result, MACS.get() - before)
 }
 
-pub(super) fn add(macs: usize) {
+pub(crate) fn add(macs: usize) {
     MACS.set(MACS.get() + macs as u64);
 }

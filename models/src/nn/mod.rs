@@ -8,7 +8,7 @@ mod conv;
 pub(crate) mod distributions;
 mod linear;
 mod lstm;
-mod macs;
+pub(crate) mod macs;
 mod params;
 pub(crate) mod spatial_transformer;
 

@@ -5,6 +5,7 @@ use tch::{Kind, Tensor};
 use super::mask_decoder::{Stage, enlarge_to, stages};
 use crate::{
     config::{CompDecoderConfig, CompNorm, MixtureConfig},
+    kernels::{self, After, Curve, Layer, Stack},
     nn::{
         Activation, BatchNorm2d, Conv2d, ConvNorm, ConvShape, GroupNorm, Linear, Mlp, Norm, Path,
         linear,
@@ -73,12 +74,20 @@ impl CompDecoder {
             ImageDecoder::SubPixel(decoder) => decoder.forward(&condition),
         };
         let side = self.image_size;
-        enlarge_to(image, side).sigmoid().view([batch, slots, 3, side, side])
+        let image = match &self.image {
+            ImageDecoder::Broadcast(BroadcastDecoder { stack: Some(_), .. })
+            | ImageDecoder::SubPixel(SubPixelDecoder { frozen: Some(_), .. }) => {
+                kernels::enlarge_to(&image, side, true)
+            }
+            _ => enlarge_to(image, side).sigmoid(),
+        };
+        image.view([batch, slots, 3, side, side])
     }
 
     pub(crate) fn freeze(&mut self) {
-        if let ImageDecoder::Broadcast(decoder) = &mut self.image {
-            decoder.freeze();
+        match &mut self.image {
+            ImageDecoder::Broadcast(decoder) => decoder.freeze(),
+            ImageDecoder::SubPixel(decoder) => decoder.freeze(),
         }
     }
 }
@@ -100,6 +109,7 @@ struct BroadcastDecoder {
     inputs: i64,
     grid: i64,
     frozen: Option<FirstLayer>,
+    stack: Option<Stack>,
 }
 
 /// The first convolution in closed form.
@@ -132,11 +142,15 @@ impl BroadcastDecoder {
             inputs,
             grid: image_size + 6 + final_kernel - 1,
             frozen: None,
+            stack: None,
         }
     }
 
     /// `[N, inputs]` to logits `[N, 3, H, W]`.
     fn forward(&self, z: &Tensor, train: bool) -> Tensor {
+        if let (Some(layer), Some(stack)) = (&self.frozen, &self.stack) {
+            return stack.forward(&linear(z, &layer.matrix, None));
+        }
         let apply = |layer: &FirstLayer| {
             linear(z, &layer.matrix, None).unsqueeze(-1).unsqueeze(-1) + &layer.map
         };
@@ -186,10 +200,17 @@ impl BroadcastDecoder {
         if let Norm::Batch(norm) = &self.first.norm {
             let (factor, offset) = norm.affine();
             let FirstLayer { matrix, map } = self.first_layer();
-            self.frozen = Some(FirstLayer {
-                matrix: matrix * factor.unsqueeze(1),
-                map: map * factor.view([-1, 1, 1]) + offset.view([-1, 1, 1]),
+            let matrix = matrix * factor.unsqueeze(1);
+            let map = map * factor.view([-1, 1, 1]) + offset.view([-1, 1, 1]);
+            let hidden = self.hidden.iter().map(|layer| {
+                let conv = layer.kernel().expect("batch norms are folded");
+                Layer::Conv(conv, After::only(Curve::Elu))
             });
+            let layers = std::iter::once(Layer::spread(&map)).chain(hidden);
+            let output = Layer::Conv(self.output.kernel(), After::only(Curve::Identity));
+            let layers = layers.chain([output]).collect();
+            self.stack = Stack::for_cpu(layers, 1, &matrix);
+            self.frozen = Some(FirstLayer { matrix, map });
         }
     }
 }
@@ -201,6 +222,7 @@ struct SubPixelDecoder {
     stages: Vec<Stage>,
     output: Conv2d,
     base_side: i64,
+    frozen: Option<Stack>,
 }
 
 impl SubPixelDecoder {
@@ -218,13 +240,23 @@ impl SubPixelDecoder {
             stages,
             output: Conv2d::new(&path.sub("output"), output_shape, config.init),
             base_side: *base_side,
+            frozen: None,
         }
     }
 
     fn forward(&self, z: &Tensor) -> Tensor {
         let side = self.base_side;
         let x = Activation::Celu.apply(&self.base.forward(z)).view([z.size()[0], -1, side, side]);
-        self.output.forward(&self.stages.iter().fold(x, |x, stage| stage.forward(&x)))
+        match &self.frozen {
+            Some(stack) => stack.forward(&x),
+            None => self.output.forward(&self.stages.iter().fold(x, |x, stage| stage.forward(&x))),
+        }
+    }
+
+    fn freeze(&mut self) {
+        let mut layers: Vec<Layer> = self.stages.iter().flat_map(Stage::layers).collect();
+        layers.push(Layer::Conv(self.output.kernel(), After::only(Curve::Identity)));
+        self.frozen = Stack::for_cpu(layers, self.base_side, &self.output.weight);
     }
 }
 
@@ -242,7 +274,7 @@ mod tests {
     #[test]
     fn closed_first_convolution_equals_the_plain_one() {
         let config = presets::push1().mixture;
-        let mut store = ParamStore::new(3, Device::Cpu);
+        let mut store = ParamStore::new(4, Device::Cpu);
         let sizes = BroadcastSizes { inputs: 64, width: 32, final_kernel: 3 };
         let mut decoder = store.build(|root| BroadcastDecoder::new(root, &config, sizes, 64));
         let _no_grad = tch::no_grad_guard();

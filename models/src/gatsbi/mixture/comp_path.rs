@@ -6,6 +6,7 @@ use tch::Tensor;
 use super::{comp_decoder::comp_norm, mask_path::MAX_SCALE, residual::ResidualUpdate};
 use crate::{
     config::MixtureConfig,
+    kernels::{After, Curve, Layer, Stack},
     nn::{Activation, Conv2d, ConvNorm, ConvShape, Linear, Mlp, Normal, Path},
 };
 
@@ -149,6 +150,8 @@ fn per_slot(action: &Tensor, slots: i64) -> Tensor {
 struct CompEncoder {
     convs: Vec<ConvNorm>,
     output: Linear,
+    image_size: i64,
+    frozen: Option<Stack>,
 }
 
 impl CompEncoder {
@@ -166,7 +169,7 @@ impl CompEncoder {
         let side = image_size >> encoder.channels.len();
         let inputs = inputs * side * side;
         let output = Linear::new(&path.sub("output"), inputs, encoder.features, config.init);
-        Self { convs, output }
+        Self { convs, output, image_size, frozen: None }
     }
 
     fn forward(&self, frame: &Tensor, log_masks: &Tensor, train: bool) -> Tensor {
@@ -174,10 +177,13 @@ impl CompEncoder {
         let masks = (log_masks.exp() + MASK_EPS).log();
         let frames = frame.unsqueeze(1).expand([-1, slots, -1, -1, -1], false);
         let input = Tensor::cat(&[frames, masks], 2).flatten(0, 1); // [B K, 4, H, W]
-        let features = self
-            .convs
-            .iter()
-            .fold(input, |x, layer| Activation::Elu.apply(&layer.forward(&x, train)));
+        let features = match &self.frozen {
+            Some(stack) => stack.forward(&input),
+            None => self
+                .convs
+                .iter()
+                .fold(input, |x, layer| Activation::Elu.apply(&layer.forward(&x, train))),
+        };
         self.output.forward(&features.flatten(1, -1)).view([batch, slots, -1])
     }
 
@@ -185,5 +191,9 @@ impl CompEncoder {
         for layer in &mut self.convs {
             layer.freeze();
         }
+        let layer = |layer: &ConvNorm| Some(Layer::Conv(layer.kernel()?, After::only(Curve::Elu)));
+        let layers: Option<Vec<Layer>> = self.convs.iter().map(layer).collect();
+        self.frozen =
+            layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.output.weight));
     }
 }

@@ -4,6 +4,7 @@ use tch::Tensor;
 
 use crate::{
     config::{EncoderConfig, InitScheme},
+    kernels::{Layer, Stack},
     nn::{Activation, Conv2d, ConvShape, GroupNorm, Linear, Path},
 };
 
@@ -12,6 +13,8 @@ use crate::{
 pub(crate) struct FrameEncoder {
     convs: Vec<(Conv2d, GroupNorm)>,
     output: Linear,
+    image_size: i64,
+    frozen: Option<Stack>,
 }
 
 impl FrameEncoder {
@@ -33,13 +36,22 @@ impl FrameEncoder {
         let side = image_size >> config.channels.len();
         let output =
             Linear::new(&path.sub("output"), inputs * side * side, config.features, scheme);
-        Self { convs, output }
+        Self { convs, output, image_size, frozen: None }
     }
 
     pub(crate) fn forward(&self, image: &Tensor) -> Tensor {
-        let features = self.convs.iter().fold(image.shallow_clone(), |x, (conv, norm)| {
-            norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
-        });
+        let features = match &self.frozen {
+            Some(stack) => stack.forward(image),
+            None => self.convs.iter().fold(image.shallow_clone(), |x, (conv, norm)| {
+                norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
+            }),
+        };
         self.output.forward(&features.flatten(1, -1))
+    }
+
+    pub(crate) fn freeze(&mut self) {
+        let layers = self.convs.iter();
+        let layers = layers.map(|(conv, norm)| Layer::Conv(conv.kernel(), norm.after_celu()));
+        self.frozen = Stack::for_cpu(layers.collect(), self.image_size, &self.output.weight);
     }
 }

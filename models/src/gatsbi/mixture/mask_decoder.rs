@@ -4,6 +4,7 @@ use tch::Tensor;
 
 use crate::{
     config::{MixtureConfig, SubPixelStage},
+    kernels::{self, After, Curve, Layer, Stack},
     nn::{Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Mlp, Path, SubPixelConv},
 };
 
@@ -18,6 +19,7 @@ pub(crate) struct MaskDecoder {
     stages: Vec<Stage>,
     output: Conv2d,
     image_size: i64,
+    frozen: Option<Stack>,
 }
 
 /// Sub-pixel enlargement, then a 3x3 convolution with CELU and group norm.
@@ -50,6 +52,12 @@ impl Stage {
     pub(super) fn forward(&self, x: &Tensor) -> Tensor {
         let x = self.conv.forward(&self.enlarge.forward(x));
         self.norm.forward(&Activation::Celu.apply(&x))
+    }
+
+    /// The same for a CPU.
+    pub(super) fn layers(&self) -> [Layer; 2] {
+        let enlarge = self.enlarge.kernel().expect("enlargement is followed by a norm");
+        [enlarge, Layer::Conv(self.conv.kernel(), self.norm.after_celu())]
     }
 }
 
@@ -106,6 +114,7 @@ impl MaskDecoder {
             stages,
             output,
             image_size,
+            frozen: None,
         }
     }
 
@@ -119,10 +128,23 @@ impl MaskDecoder {
         let condition = Tensor::cat(&[z.narrow(1, 0, slots), action], -1);
         let condition = self.condition.forward(&condition); // [B, K-1, inputs]
         let x = condition.reshape([batch * slots, -1, 1, 1]);
-        let x = self.base.1.forward(&Activation::Celu.apply(&self.base.0.forward(&x)));
-        let x = self.stages.iter().fold(x, |x, stage| stage.forward(&x));
-        let logits = enlarge_to(self.output.forward(&x), self.image_size);
+        let logits = match &self.frozen {
+            Some(stack) => kernels::enlarge_to(&stack.forward(&x), self.image_size, false),
+            None => {
+                let x = self.base.1.forward(&Activation::Celu.apply(&self.base.0.forward(&x)));
+                let x = self.stages.iter().fold(x, |x, stage| stage.forward(&x));
+                enlarge_to(self.output.forward(&x), self.image_size)
+            }
+        };
         logits.view([batch, slots, 1, self.image_size, self.image_size])
+    }
+
+    pub(crate) fn freeze(&mut self) {
+        let (base, norm) = &self.base;
+        let mut layers = vec![Layer::Conv(base.kernel(), norm.after_celu())];
+        layers.extend(self.stages.iter().flat_map(Stage::layers));
+        layers.push(Layer::Conv(self.output.kernel(), After::only(Curve::Identity)));
+        self.frozen = Stack::for_cpu(layers, 1, &self.output.weight);
     }
 }
 

@@ -10,7 +10,7 @@ mod mask_decoder;
 mod mask_path;
 mod residual;
 
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use self::{
     comp_decoder::CompDecoder,
@@ -21,6 +21,7 @@ use self::{
 };
 use crate::{
     config::MixtureConfig,
+    kernels,
     nn::{LearnedState, LstmBank, Normal, Path},
     noise::{Noise, Site},
 };
@@ -102,6 +103,8 @@ pub struct Mixture {
     z_comp_start: Tensor,
     z_mask: i64,
     z_comp: i64,
+    /// Frozen on a CPU.
+    kernels: bool,
 }
 
 impl Mixture {
@@ -129,6 +132,7 @@ impl Mixture {
             z_comp_start: start("z_comp_start", config.z_comp),
             z_mask: config.z_mask,
             z_comp: config.z_comp,
+            kernels: false,
         }
     }
 
@@ -175,7 +179,7 @@ impl Mixture {
             &first,
             &noise.normal(Site::Mask, &shape(state, self.z_mask)),
         );
-        let log_masks = stick_breaking(&self.mask_decoder.forward(&masks.z, action));
+        let log_masks = self.log_masks(&masks.z, action);
         let comps = self.comps.posterior(
             frame,
             &log_masks,
@@ -224,8 +228,17 @@ impl Mixture {
 
     /// Makes the exact inference forms; gradients must be off from here on.
     pub fn freeze(&mut self) {
+        self.kernels = self.z_mask_start.device() == Device::Cpu;
+        self.encoder.freeze();
+        self.mask_decoder.freeze();
         self.comps.freeze();
         self.comp_decoder.freeze();
+    }
+
+    /// Log masks of mask latents, `[B, K, 1, H, W]`.
+    fn log_masks(&self, z: &Tensor, action: &Tensor) -> Tensor {
+        let logits = self.mask_decoder.forward(z, action);
+        if self.kernels { kernels::break_sticks(&logits) } else { stick_breaking(&logits) }
     }
 
     fn predict(
@@ -240,7 +253,7 @@ impl Mixture {
         let mask_noise = &noise.normal(Site::Mask, &shape(state, self.z_mask));
         let drive = Drive::Sample { noise: mask_noise, first };
         let masks = self.masks.prior(&state.z_mask, &state.mask_prior.h, action, &drive);
-        let log_masks = stick_breaking(&self.mask_decoder.forward(&masks.z, action));
+        let log_masks = self.log_masks(&masks.z, action);
         let comp_noise = noise.normal(Site::Component, &shape(state, self.z_comp));
         let h_prior = &state.comp_prior.h;
         let comps = self.comps.prior(&masks.z, &state.z_comp, h_prior, action, first, &comp_noise);
@@ -260,7 +273,8 @@ impl Mixture {
         train: bool,
     ) -> (MixtureState, MixtureStep) {
         let components = self.comp_decoder.forward(&comps.z, action, train);
-        let mu_mix = (log_masks.exp() * &components).sum_dim_intlist(1, false, Kind::Float);
+        let mix = if self.kernels { kernels::mix } else { mix };
+        let mu_mix = mix(&log_masks, &components);
         let encoding = self.encoder.forward(&mu_mix).unsqueeze(1); // [B, 1, e]
         let encodings = encoding.expand([-1, masks.z.size()[1], -1], false);
         let inputs = |z: &Tensor| Tensor::cat(&[z, &encodings], -1);
@@ -296,6 +310,14 @@ impl Mixture {
         };
         (next, step)
     }
+}
+
+/// `mu_mix = Σ_k π_k o_k`.
+///
+/// # Shapes
+/// Log masks `[B, K, 1, H, W]` and images `[B, K, 3, H, W]`; returns `[B, 3, H, W]`.
+fn mix(log_masks: &Tensor, components: &Tensor) -> Tensor {
+    (log_masks.exp() * components).sum_dim_intlist(1, false, Kind::Float)
 }
 
 /// `[B, K, width]` of a state's slots.

@@ -4,7 +4,11 @@ use tch::Tensor;
 
 use crate::{
     config::ObjectConfig,
-    nn::{Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Linear, Path},
+    kernels::{self, Layer, Stack},
+    nn::{
+        Activation, Conv2d, ConvShape, GroupNorm, InitScheme, Linear, Path,
+        spatial_transformer::crop,
+    },
 };
 
 /// Glimpses `[N, 3, s, s]` to features: halving convolutions with CELU and group norm, then a linear layer.
@@ -12,6 +16,8 @@ use crate::{
 pub(crate) struct GlimpseEncoder {
     convs: Vec<(Conv2d, GroupNorm)>,
     output: Linear,
+    side: i64,
+    frozen: Option<Stack>,
 }
 
 impl GlimpseEncoder {
@@ -33,17 +39,38 @@ impl GlimpseEncoder {
             config.hidden,
             InitScheme::Framework,
         );
-        Self { convs, output }
+        Self { convs, output, side: config.glimpse, frozen: None }
+    }
+
+    /// Cuts the glimpses that it encodes out of images.
+    ///
+    /// # Shapes
+    /// `image [B, 3, H, W]`, `z_where [B, N, 4]`; returns `[B, N, 3, s, s]`.
+    pub(crate) fn crop(&self, image: &Tensor, z_where: &Tensor) -> Tensor {
+        match &self.frozen {
+            Some(_) => kernels::crop(image, z_where, self.side),
+            None => crop(image, z_where, self.side),
+        }
     }
 
     /// # Shapes
     /// `[B, N, 3, s, s]`; returns `[B, N, hidden]`.
     pub(crate) fn forward(&self, glimpses: &Tensor) -> Tensor {
         let (batch, count) = (glimpses.size()[0], glimpses.size()[1]);
-        let features = self.convs.iter().fold(glimpses.flatten(0, 1), |x, (conv, norm)| {
-            norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
-        });
+        let glimpses = glimpses.flatten(0, 1);
+        let features = match &self.frozen {
+            Some(stack) => stack.forward(&glimpses),
+            None => self.convs.iter().fold(glimpses, |x, (conv, norm)| {
+                norm.forward(&Activation::Celu.apply(&conv.forward(&x)))
+            }),
+        };
         self.output.forward(&features.flatten(1, -1)).view([batch, count, -1])
+    }
+
+    pub(crate) fn freeze(&mut self) {
+        let layers = self.convs.iter();
+        let layers = layers.map(|(conv, norm)| Layer::Conv(conv.kernel(), norm.after_celu()));
+        self.frozen = Stack::for_cpu(layers.collect(), self.side, &self.output.weight);
     }
 }
 

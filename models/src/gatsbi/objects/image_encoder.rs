@@ -4,6 +4,7 @@ use tch::Tensor;
 
 use crate::{
     config::ObjectConfig,
+    kernels::{After, Curve, Layer, Stack},
     nn::{BatchNorm2d, Conv2d, ConvNorm, ConvShape, Init, InitScheme, Norm, Path},
 };
 
@@ -16,6 +17,8 @@ pub(crate) struct ImageEncoder {
     stem: ConvNorm,
     blocks: Vec<BasicBlock>,
     last: Conv2d,
+    image_size: i64,
+    frozen: Option<Stack>,
 }
 
 impl ImageEncoder {
@@ -38,10 +41,14 @@ impl ImageEncoder {
         }
         let stride = image_size / (config.grid << channels.len());
         let last = ConvShape { stride, ..ConvShape::same(inputs, config.hidden, 3) };
-        Self { stem, blocks, last: Conv2d::new(&path.sub("last"), last, InitScheme::Framework) }
+        let last = Conv2d::new(&path.sub("last"), last, InitScheme::Framework);
+        Self { stem, blocks, last, image_size, frozen: None }
     }
 
     pub(crate) fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+        if let Some(stack) = &self.frozen {
+            return stack.forward(x);
+        }
         let x = self.stem(x, train);
         self.last.forward(&self.blocks.iter().fold(x, |x, block| block.forward(&x, train)))
     }
@@ -56,6 +63,13 @@ impl ImageEncoder {
         for block in &mut self.blocks {
             block.freeze();
         }
+        let stem = self.stem.kernel().map(|stem| Layer::Conv(stem, After::only(Curve::Relu)));
+        let last = Layer::Conv(self.last.kernel(), After::only(Curve::Identity));
+        let blocks = self.blocks.iter().map(BasicBlock::layer);
+        let layers = std::iter::once(stem).chain(blocks).chain([Some(last)]).collect();
+        let layers: Option<Vec<Layer>> = layers;
+        self.frozen =
+            layers.and_then(|layers| Stack::for_cpu(layers, self.image_size, &self.last.weight));
     }
 }
 
@@ -96,6 +110,19 @@ impl BasicBlock {
             Some(shortcut) => (y + shortcut.forward(x, train)).relu(),
             None => (y + x).relu(),
         }
+    }
+
+    /// The same for a CPU, once it is frozen.
+    fn layer(&self) -> Option<Layer> {
+        let shortcut = match &self.shortcut {
+            Some(shortcut) => Some(shortcut.kernel()?),
+            None => None,
+        };
+        Some(Layer::Residual {
+            first: self.first.kernel()?,
+            second: self.second.kernel()?,
+            shortcut,
+        })
     }
 
     fn freeze(&mut self) {

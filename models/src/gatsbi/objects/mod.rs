@@ -244,6 +244,8 @@ impl ObjectModule {
 
     /// Makes the exact inference forms; gradients must be off from here on.
     pub fn freeze(&mut self) {
+        self.propagation.freeze();
+        self.surroundings.freeze();
         self.discovery.freeze();
         self.post.freeze();
         self.prior.freeze();

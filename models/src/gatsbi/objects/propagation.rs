@@ -12,7 +12,6 @@ use crate::{
     nn::{
         InitScheme, Mlp, Normal, Path,
         distributions::{kl_bernoulli, relaxed_bernoulli},
-        spatial_transformer::crop,
     },
     noise::{Noise, Site},
 };
@@ -29,7 +28,6 @@ pub(crate) struct Propagation {
     pub(super) attributes: AttributeNet,
     layout: Layout,
     proposal_update: (f64, f64),
-    glimpse: i64,
 }
 
 /// Objects carried into a frame with its help.
@@ -66,7 +64,6 @@ impl Propagation {
             attributes: AttributeNet::new(&attributes, hidden, layout, &config.updates),
             layout,
             proposal_update: config.updates.proposal,
-            glimpse: config.glimpse,
         }
     }
 
@@ -83,7 +80,8 @@ impl Propagation {
     ) -> Propagated {
         let previous = self.layout.split(z);
         let proposal = self.proposal(&previous, h_post);
-        let encoding = self.proposal_encoder.forward(&crop(frame, &proposal, self.glimpse));
+        let glimpses = self.proposal_encoder.crop(frame, &proposal);
+        let encoding = self.proposal_encoder.forward(&glimpses);
         let dyna =
             Normal::from_head(&self.dyna_post.forward(&Tensor::cat(&[&encoding, h_post], -1)));
         let z_dyna = dyna.sample(&noise.normal(Site::Dynamics, &dyna.loc.size()));
@@ -123,6 +121,10 @@ impl Propagation {
         let mut next = self.attributes.update(&previous, &attributes, z_dyna, noise);
         bound_scale(&mut next, tracking);
         next.join()
+    }
+
+    pub(crate) fn freeze(&mut self) {
+        self.proposal_encoder.freeze();
     }
 
     /// The prior of the dynamics latents given the prior memory.

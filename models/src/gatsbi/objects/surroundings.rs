@@ -6,7 +6,7 @@ use tch::Tensor;
 use super::{glimpse::GlimpseEncoder, latents::place};
 use crate::{
     config::{GatsbiConfig, Interaction},
-    nn::{Activation, InitScheme, Mlp, Path, spatial_transformer::crop},
+    nn::{Activation, InitScheme, Mlp, Path},
 };
 
 /// The agent as objects see it: `u^r = [z^r, h^r]` and its action.
@@ -25,7 +25,6 @@ pub struct Agent {
 pub(crate) struct Surroundings {
     pub(super) encoder: GlimpseEncoder,
     agent: Option<AgentEffect>,
-    glimpse: i64,
     margin: f64,
 }
 
@@ -73,7 +72,6 @@ impl Surroundings {
         Self {
             encoder: GlimpseEncoder::new(&path.sub("bg_attention_encoder"), objects),
             agent,
-            glimpse: objects.glimpse,
             margin: objects.updates.environment,
         }
     }
@@ -86,11 +84,15 @@ impl Surroundings {
         }
     }
 
+    pub(crate) fn freeze(&mut self) {
+        self.encoder.freeze();
+    }
+
     /// The crop of `mu_mix [B, 3, H, W]` around objects at `z_where [B, N, 4]`, `[B, N, 3, s, s]`.
     pub(crate) fn crop(&self, mu_mix: &Tensor, z_where: &Tensor) -> Tensor {
         let scale = z_where.narrow(-1, 0, 2) + self.margin;
         let window = Tensor::cat(&[scale, z_where.narrow(-1, 2, 2)], -1);
-        crop(mu_mix, &window, self.glimpse)
+        self.encoder.crop(mu_mix, &window)
     }
 
     /// The encoded environment e^s of objects at `z_where [B, N, 4]`, `[B, N, hidden]`; the same for both
