@@ -40,7 +40,7 @@ ROBOTS = {
     },
 }
 VELOCITY_GAINS = [600, 600, 500, 400, 200, 150, 100]
-VISUAL_TRIANGLES = 6000
+VISUAL_TRIANGLES = 9000
 LEAST_TRIANGLES = 60
 HULL_TRIANGLES = 200
 # The source's vertices are split along seams; those within this many metres become one, so that surfaces are connected.
