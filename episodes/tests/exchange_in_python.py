@@ -1,4 +1,4 @@
-"""What `gatsbi-episodes` exports is read by the formats' own packages, byte by byte; a video is imported with a real decoder.
+"""The formats' own packages read what `gatsbi-episodes` exports, byte by byte; a video is imported with a real decoder.
 
 Run with GATSBI_EPISODES naming the program, and with imageio-ffmpeg, mcap, mcap-protobuf-support, numpy, pandas, pillow and
 pyarrow installed.

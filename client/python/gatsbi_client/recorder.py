@@ -1,4 +1,4 @@
-"""Records what a robot sees and does to an MCAP file, which Foxglove and Rerun open and `gatsbi-episodes import mcap` reads.
+"""Records what a robot sees and does to an MCAP file, which Foxglove opens and `gatsbi-episodes import mcap` reads.
 
     with Recorder("run.mcap") as recorder:
         for frame, action in robot:
@@ -31,7 +31,7 @@ _ACTION = {
 
 
 class Recorder:
-    """One recording, an episode. The file has its name once the recorder is closed without a failure, and else is gone."""
+    """One recording, an episode. The file has its name once the recorder is closed; after a failure there is none."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = Path(path)
@@ -46,9 +46,9 @@ class Recorder:
     def add(
         self, frame: npt.NDArray[np.uint8] | None, action: npt.ArrayLike | None = None, *, at: float | None = None
     ) -> None:
-        """What was seen, `[H, W, 3]` bytes or None for a dropped frame, and the action that led to it, as `observe` takes them.
+        """What was seen, `[H, W, 3]` bytes or None for a dropped frame, and the action that led to it.
 
-        `at` is the time in seconds since 1970, now by default. The action is logged a nanosecond before its frame: what
+        Both as `observe` takes them. `at` is the time in seconds since 1970, now by default. The action is logged a nanosecond before its frame: what
         held since the frame before.
         """
         now = max(round((time.time() if at is None else at) * 1e9), self._last + 2)

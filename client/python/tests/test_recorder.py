@@ -40,7 +40,8 @@ def test_the_reference_library_reads_it(frames, tmp_path):
 
 
 def test_a_failure_leaves_nothing(frames, tmp_path):
-    with pytest.raises(ValueError, match=r"float64 of shape \[2, 2\], expected uint8"), Recorder(tmp_path / "run.mcap") as recorder:
-        recorder.add(frames[0])
-        recorder.add(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"float64 of shape \[2, 2\], expected uint8"):
+        with Recorder(tmp_path / "run.mcap") as recorder:
+            recorder.add(frames[0])
+            recorder.add(np.zeros((2, 2)))
     assert list(tmp_path.iterdir()) == []

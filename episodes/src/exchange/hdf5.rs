@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
-use hdf5_reader::{Dataset, Datatype, Group, Hdf5File};
+use hdf5_reader::{Dataset, Datatype, Hdf5File, group::Group};
 
 use crate::{
     EpisodeData, InvalidEpisode, Result, WriterOptions,
@@ -189,7 +189,7 @@ impl Demo {
         let obs = self.group(path, "obs")?;
         let pictures = self.set(path, &obs, camera)?;
         let (width, height) = shape.sides;
-        let length = pictures.shape()[0];
+        let length = pictures.shape().first().copied().unwrap_or(0);
         if pictures.shape() != [length, height.into(), width.into(), 3] {
             let expected = format!("[T, {height}, {width}, 3] bytes");
             return Err(self.layout(path, camera, &pictures, &expected));
@@ -270,7 +270,7 @@ impl Demo {
         group.dataset(name).map_err(|e| self.damaged(path, name, e))
     }
 
-    fn damaged(&self, path: &Path, column: &str, e: hdf5_reader::Error) -> crate::Error {
+    fn damaged(&self, path: &Path, column: &str, e: hdf5_reader::error::Error) -> crate::Error {
         let problem = ImportProblem::damaged("a group or data set", e);
         problem.at(path, Some(self.number), Some(column))
     }

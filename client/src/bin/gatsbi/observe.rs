@@ -167,7 +167,7 @@ struct Log {
 
 impl Log {
     fn create(path: &Path, recording: &Recording) -> anyhow::Result<Self> {
-        let writer = McapWriter::create(path, &recording.info, Some(recording.episode.id()))?;
+        let writer = McapWriter::create(path, &recording.info, None)?;
         Ok(Self { writer, last: 0 })
     }
 

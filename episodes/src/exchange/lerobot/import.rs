@@ -323,7 +323,7 @@ impl Reader<'_> {
             problem.at(&path, Some(number), Some(camera))
         };
         let first = (from * self.info.fps).round().max(0.0) as u64;
-        for number in first..first + length {
+        for number in first..first.saturating_add(length) {
             let open = self.video.as_mut().filter(|video| video.path == path);
             let picture = match open {
                 Some(video) => video.frame(number).map_err(|problem| at(number, problem))?,

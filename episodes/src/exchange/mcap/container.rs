@@ -1,7 +1,7 @@
 //! The container: records of an opcode, a length and fields, little-endian, some of them together in compressed chunks.
 //!
 //! Our own because it is small: the crate `mcap` brings three derive macros, three containers and two compressors in C for
-//! it, and what is read and written here is checked against the reference library for Python. LZ4 is not read.
+//! it, and what is read and written here is checked against the reference library for Python.
 
 use std::{
     collections::BTreeMap,
@@ -175,16 +175,17 @@ fn unpack(body: &[u8]) -> Result<Vec<u8>, ImportProblem> {
     if size > MAX_RECORD {
         return Err(too_large(size));
     }
-    let read = |decoder: zstd::Decoder<'_, _>| {
+    let read = |decoder: &mut dyn Read| {
         let mut records = Vec::new();
         // One byte more than it may be shows that it is too long.
         decoder.take(size + 1).read_to_end(&mut records).map(|_| records)
     };
     let records = match compression.as_str() {
         "" => Ok(packed.to_vec()),
-        "zstd" => zstd::Decoder::new(packed).and_then(read),
+        "lz4" => read(&mut lz4_flex::frame::FrameDecoder::new(packed)),
+        "zstd" => zstd::Decoder::new(packed).and_then(|mut decoder| read(&mut decoder)),
         other => {
-            let (found, expected) = (format!("`{other}`"), "zstd or none; `mcap compress` converts recordings".into());
+            let (found, expected) = (format!("`{other}`"), "lz4, zstd or none".into());
             return Err(ImportProblem::Layout { what: "the compression", found, expected });
         }
     };

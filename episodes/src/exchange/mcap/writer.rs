@@ -325,6 +325,7 @@ impl Record<'_> {
 
 /// `foxglove/CompressedImage.proto` with what it imports, for readers that know neither.
 fn image_schema() -> Vec<u8> {
+    const TIMESTAMP: &str = "google/protobuf/timestamp.proto";
     let field = |name: &str, number, kind: Type, of: Option<&str>| FieldDescriptorProto {
         name: Some(name.into()),
         number: Some(number),
@@ -345,7 +346,6 @@ fn image_schema() -> Vec<u8> {
             ..FileDescriptorProto::default()
         }
     };
-    const TIMESTAMP: &str = "google/protobuf/timestamp.proto";
     let timestamp =
         vec![field("seconds", 1, Type::Int64, None), field("nanos", 2, Type::Int32, None)];
     let image = vec![
