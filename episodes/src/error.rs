@@ -8,6 +8,8 @@ use std::{io, path::PathBuf};
 use parquet::errors::ParquetError;
 use zip::result::ZipError;
 
+#[cfg(feature = "exchange")]
+use crate::exchange::ImportProblem;
 use crate::schema::column;
 
 /// The result of this crate's operations.
@@ -243,6 +245,20 @@ pub enum Error {
         /// What is wrong with it.
         source: InvalidEpisode,
     },
+
+    /// A file of another format cannot be imported.
+    #[cfg(feature = "exchange")]
+    #[error("{path}{}", at_cell(*.row, .column.as_deref()))]
+    Import {
+        /// The file.
+        path: PathBuf,
+        /// Row, record, message or frame in it, counted from 0.
+        row: Option<u64>,
+        /// Column, feature, topic, key or data set.
+        column: Option<String>,
+        /// What is wrong there.
+        source: ImportProblem,
+    },
 }
 
 /// What is wrong with the contents of one episode. Columns are named as in the file.
@@ -362,4 +378,11 @@ impl InvalidEpisode {
 
 fn at_episode(episode: Option<usize>) -> String {
     episode.map_or_else(String::new, |episode| format!(" at episode {episode}"))
+}
+
+#[cfg(feature = "exchange")]
+fn at_cell(row: Option<u64>, column: Option<&str>) -> String {
+    let row = row.map_or_else(String::new, |row| format!(", row {row}"));
+    let column = column.map_or_else(String::new, |column| format!(", `{column}`"));
+    row + &column
 }

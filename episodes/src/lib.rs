@@ -8,7 +8,7 @@
 //! - [`Episode`]: one episode in memory, checked once. [`Clip`]: some of its frames with the actions that led to them.
 //! - [`DatasetWriter`]: writes a folder that is whole at every moment and can be appended to; [`write_whole`]: all or nothing.
 //! - [`Dataset`]: opens, lists and reads; [`Prefetch`]: reads ahead for training in an order that a seed decides.
-//! - [`import_npz()`]: converts numpy archives. The program `gatsbi-episodes` imports, inspects and splits data sets.
+//! - [`import_npz()`]: converts numpy archives; [`exchange`]: LeRobot, MCAP, HDF5, TFRecords. [`Fit`]: pictures of other sizes. The program `gatsbi-episodes` imports, inspects and splits data sets.
 //! - [`Error`]: every failure, with file, row and column.
 //!
 //! ```
@@ -44,11 +44,14 @@
 //! # }
 //! ```
 
+#[cfg(feature = "exchange")]
+pub mod exchange;
 pub mod schema;
 
 mod clip;
 mod episode;
 mod error;
+mod fit;
 mod import_npz;
 mod manifest;
 mod pending;
@@ -64,6 +67,7 @@ mod writer;
 pub use clip::Clip;
 pub use episode::{Episode, EpisodeData};
 pub use error::{Error, InvalidEpisode, Result};
+pub use fit::{Fit, centre_square};
 pub use import_npz::{NpzImport, import_npz};
 pub use manifest::{Manifest, ShardEntry};
 pub use prefetch::{Prefetch, PrefetchOptions};

@@ -1,4 +1,4 @@
-//! `gatsbi-episodes`: imports, inspects and splits data sets from the command line.
+//! `gatsbi-episodes`: imports, exports, inspects and splits data sets from the command line.
 
 use std::{
     io::{self, IsTerminal as _, Write as _},
@@ -8,16 +8,16 @@ use std::{
 
 use anyhow::{Context as _, bail, ensure};
 use clap::{Args, Parser, Subcommand};
-use gatsbi_episodes::{
-    ActionDimension, Dataset, Manifest, NpzImport, WriterOptions, import_npz, write_whole,
-};
+use gatsbi_episodes::{Dataset, Manifest, WriterOptions, write_whole};
 use indicatif::{ProgressBar, ProgressStyle};
 
 mod report;
+mod transfer;
 
 use report::Report;
+use transfer::{Export, Import};
 
-/// Robot episodes in Parquet files: import, inspect, split.
+/// Robot episodes in Parquet files: import, export, inspect, split.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Cli {
@@ -30,50 +30,13 @@ enum Command {
     /// Convert data of another format to a new data set.
     #[command(subcommand)]
     Import(Import),
+    /// Convert a data set to another format.
+    #[command(subcommand)]
+    Export(Export),
     /// Print the description, counts, sizes and action statistics of a data set.
     Info(Info),
     /// Copy some episodes of a data set to a new one; ids are kept.
     Split(Split),
-}
-
-#[derive(Debug, Subcommand)]
-enum Import {
-    /// A numpy archive with the arrays rgb [E,T,H,W,3] u1, act [E,T,A] f4 and, if known, lab [E,T,H,W] u1 (0 background,
-    /// 1 agent, 2.. objects), obj [E,T,M,3] f4 (metres, NaN = absent) and n [E] (object counts).
-    Npz(Npz),
-}
-
-#[derive(Debug, Args)]
-struct Npz {
-    /// The archive.
-    file: PathBuf,
-    /// Folder to create.
-    #[arg(long)]
-    out: PathBuf,
-    /// Name of the data set.
-    #[arg(long, default_value = "push1")]
-    name: String,
-    /// Seconds between two frames.
-    #[arg(long, default_value_t = 0.2)]
-    frame_period: f64,
-    /// Names of the action dimensions, separated by commas.
-    #[arg(
-        long,
-        value_delimiter = ',',
-        default_value = "panda_joint1,panda_joint2,panda_joint3,panda_joint4,panda_joint5,panda_joint6,panda_joint7"
-    )]
-    action_names: Vec<String>,
-    /// Units of the action dimensions, separated by commas; one alone holds for all.
-    #[arg(long, value_delimiter = ',', default_value = "rad/s")]
-    action_units: Vec<String>,
-    /// Program, simulator or robot that made the data, kept as its provenance.
-    #[arg(long, default_value = "unknown")]
-    generator: String,
-    /// Id of the first episode; the others count on from it.
-    #[arg(long, default_value_t = 0)]
-    first_id: u64,
-    #[command(flatten)]
-    writer: Writer,
 }
 
 #[derive(Debug, Args)]
@@ -117,38 +80,11 @@ struct Writer {
 
 fn main() -> anyhow::Result<()> {
     match Cli::parse().command {
-        Command::Import(Import::Npz(npz)) => import(&npz),
+        Command::Import(import) => import.run(),
+        Command::Export(export) => export.run(),
         Command::Info(info) => inspect(&info),
         Command::Split(split) => copy(&split),
     }
-}
-
-fn import(npz: &Npz) -> anyhow::Result<()> {
-    let (names, units) = (&npz.action_names, &npz.action_units);
-    ensure!(
-        units.len() == 1 || units.len() == names.len(),
-        "--action-units gives {} units for the {} names of --action-names; give one for all or one for each",
-        units.len(),
-        names.len()
-    );
-    let dimension = |(name, unit): (&String, &String)| ActionDimension {
-        name: name.clone(),
-        unit: unit.clone(),
-    };
-    let import = NpzImport {
-        name: npz.name.clone(),
-        frame_period_seconds: npz.frame_period,
-        actions: names.iter().zip(units.iter().cycle()).map(dimension).collect(),
-        generator: npz.generator.clone(),
-        first_id: npz.first_id,
-    };
-    let bar = progress_bar();
-    let manifest = import_npz(&npz.file, &npz.out, &import, npz.writer.options(), |done, all| {
-        bar.set_length(all as u64);
-        bar.set_position(done as u64);
-    })?;
-    bar.finish_and_clear();
-    print_written(&npz.out, &manifest)
 }
 
 fn inspect(info: &Info) -> anyhow::Result<()> {

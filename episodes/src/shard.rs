@@ -234,7 +234,9 @@ impl Shard {
 
 /// Runs a part of the Parquet reader, which panics on some damaged pages, and makes that an error like the others. The panic
 /// hook still reports it.
-fn guarded<T>(read: impl FnOnce() -> Result<T, ParquetError>) -> Result<T, ParquetError> {
+pub(crate) fn guarded<T>(
+    read: impl FnOnce() -> Result<T, ParquetError>,
+) -> Result<T, ParquetError> {
     catch_unwind(AssertUnwindSafe(read)).unwrap_or_else(|panic| {
         let text = panic.downcast::<String>().map_or_else(
             |panic| panic.downcast::<&str>().map_or_else(|_| String::new(), |s| s.to_string()),

@@ -49,6 +49,15 @@ pub fn write_whole(
     options: WriterOptions,
     fill: impl FnOnce(&mut DatasetWriter) -> Result<()>,
 ) -> Result<Manifest> {
+    make_whole(dir, |built| {
+        let mut writer = DatasetWriter::create(built, info, options)?;
+        fill(&mut writer)?;
+        writer.finish()
+    })
+}
+
+/// Creates folder `dir` with everything that `build` puts into the folder it is given, or not at all.
+pub(crate) fn make_whole<T>(dir: &Path, build: impl FnOnce(&Path) -> Result<T>) -> Result<T> {
     if dir.exists() {
         is_empty(dir)?;
     }
@@ -57,15 +66,14 @@ pub fn write_whole(
         _ => Path::new("."),
     };
     fs_err::create_dir_all(parent)?;
-    // The data set is a folder inside the temporary one, which only its maker may enter.
+    // What is built is a folder inside the temporary one, which only its maker may enter.
     let staging = tempfile::Builder::new().prefix(".gatsbi-episodes-").tempdir_in(parent)?;
     let built = staging.path().join("built");
-    let mut writer = DatasetWriter::create(&built, info, options)?;
-    fill(&mut writer)?;
-    let manifest = writer.finish()?;
+    fs_err::create_dir(&built)?;
+    let made = build(&built)?;
     fs_err::rename(&built, dir)?;
     sync_folder(parent)?;
-    Ok(manifest)
+    Ok(made)
 }
 
 impl Default for WriterOptions {

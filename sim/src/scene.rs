@@ -17,6 +17,8 @@ pub enum Scene {
     Push1,
     /// A Panda strikes two to four nearly elastic balls that roll for long.
     Roll,
+    /// The same with an arm that goes around between four places, whatever lies there.
+    RollCycle,
     /// A Sawyer pushes five to seven cubes with displacements of its gripper.
     Push2,
     /// Three elastic spheres in a closed box, seen as a depth image; nobody acts.
@@ -59,14 +61,22 @@ pub struct ActionSpec {
 
 impl Scene {
     /// All scenes.
-    pub const ALL: [Self; 6] =
-        [Self::Push1, Self::Roll, Self::Push2, Self::Balls3, Self::Balls6, Self::Balls9];
+    pub const ALL: [Self; 7] = [
+        Self::Push1,
+        Self::Roll,
+        Self::RollCycle,
+        Self::Push2,
+        Self::Balls3,
+        Self::Balls6,
+        Self::Balls9,
+    ];
 
     /// The name, as data sets and the command line use it.
     pub fn name(self) -> &'static str {
         match self {
             Self::Push1 => "push1",
             Self::Roll => "roll",
+            Self::RollCycle => "roll-cycle",
             Self::Push2 => "push2",
             Self::Balls3 => "balls3",
             Self::Balls6 => "balls6",
@@ -153,7 +163,7 @@ mod tests {
         let error = "push3".parse::<Scene>().unwrap_err().to_string();
         assert_eq!(
             error,
-            "there is no scene `push3`; there are push1, roll, push2, balls3, balls6, balls9"
+            "there is no scene `push3`; there are push1, roll, roll-cycle, push2, balls3, balls6, balls9"
         );
     }
 

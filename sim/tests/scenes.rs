@@ -81,6 +81,11 @@ fn a_panda_strikes_balls() {
 }
 
 #[test]
+fn a_panda_goes_around_and_strikes_balls() {
+    check_robot_scene(Scene::RollCycle, 3);
+}
+
+#[test]
 fn a_sawyer_pushes() {
     check_robot_scene(Scene::Push2, 3);
 }

@@ -99,8 +99,17 @@ pub(crate) struct Script {
     pub(crate) travel_height: f64,
     /// Least and greatest speed of a push, m/s.
     pub(crate) speed: [f64; 2],
-    /// How far a push goes on behind the object's centre, least and most.
-    pub(crate) sweep: [f64; 2],
+    /// What it goes for.
+    pub(crate) aim: Aim,
+}
+
+/// What the script goes for.
+#[derive(Debug)]
+pub(crate) enum Aim {
+    /// A random object. A push goes on behind its centre so far, least and most.
+    Objects { sweep: [f64; 2] },
+    /// These places of the tray one after the other, each missed by a little (the spread, metres), from a random one on.
+    Cycle { places: [[f64; 2]; 4], spread: f64 },
 }
 
 /// Largest joint velocity, rad/s: that of the real Panda's slower joints.
@@ -139,10 +148,15 @@ static PUSH1: Layout = Layout {
     camera: CameraPlace { position: [1.16, 0.0, 0.92], look_at: [0.47, 0.0, 0.04], fovy: 39.0 },
     look: Look { table: [0.75, 0.7, 0.62], rim: [0.35, 0.27, 0.2], floor: [0.42, 0.42, 0.45] },
     control: Control::JointVelocity,
-    script: Script { height: 0.03, travel_height: 0.03, speed: [0.16, 0.34], sweep: [0.08, 0.18] },
+    script: Script {
+        height: 0.03,
+        travel_height: 0.03,
+        speed: [0.16, 0.34],
+        aim: Aim::Objects { sweep: [0.08, 0.18] },
+    },
 };
 
-static ROLL: Layout = Layout {
+const ROLL: Layout = Layout {
     robot: Robot::Panda,
     frames: 40,
     period: 0.15,
@@ -164,8 +178,21 @@ static ROLL: Layout = Layout {
         height: 0.035,
         travel_height: 0.035,
         speed: [0.20, 0.42],
-        sweep: [0.02, 0.06],
+        aim: Aim::Objects { sweep: [0.02, 0.06] },
     },
+};
+
+/// Two loops that cross in the middle of the tray.
+static ROLL_CYCLE: Layout = Layout {
+    script: Script {
+        speed: [0.30, 0.34],
+        aim: Aim::Cycle {
+            places: [[0.40, -0.17], [0.64, 0.17], [0.40, 0.17], [0.64, -0.17]],
+            spread: 0.01,
+        },
+        ..ROLL.script
+    },
+    ..ROLL
 };
 
 static PUSH2: Layout = Layout {
@@ -186,7 +213,12 @@ static PUSH2: Layout = Layout {
     camera: CameraPlace { position: [1.36, 0.0, 0.95], look_at: [0.60, 0.0, 0.04], fovy: 41.0 },
     look: Look { table: [0.55, 0.57, 0.6], rim: [0.25, 0.27, 0.3], floor: [0.6, 0.58, 0.55] },
     control: Control::Gripper,
-    script: Script { height: 0.03, travel_height: 0.105, speed: [0.22, 0.42], sweep: [0.06, 0.20] },
+    script: Script {
+        height: 0.03,
+        travel_height: 0.105,
+        speed: [0.22, 0.42],
+        aim: Aim::Objects { sweep: [0.06, 0.20] },
+    },
 };
 
 impl Layout {
@@ -195,6 +227,7 @@ impl Layout {
         match scene {
             Scene::Push1 => Some(&PUSH1),
             Scene::Roll => Some(&ROLL),
+            Scene::RollCycle => Some(&ROLL_CYCLE),
             Scene::Push2 => Some(&PUSH2),
             Scene::Balls3 | Scene::Balls6 | Scene::Balls9 => None,
         }

@@ -3,6 +3,8 @@
 //! A push begins on the side of the object that is away from the tray's centre, more or less, and ends before the rim:
 //! objects that are squeezed against the rim would jump out. On its way the hand does not go around objects, so it
 //! touches others too.
+//!
+//! Where the layout says so, the hand goes around between fixed places instead, whatever lies there.
 
 use std::collections::VecDeque;
 
@@ -10,7 +12,7 @@ use nalgebra::{Vector2, Vector3};
 use rand::{RngExt as _, rngs::ChaCha8Rng};
 use rand_distr::StandardNormal;
 
-use crate::robot::catalogue::{Script, Tray};
+use crate::robot::catalogue::{Aim, Script, Tray};
 
 /// Tries for a push that keeps every rule.
 const TRIES: usize = 200;
@@ -36,11 +38,17 @@ pub(crate) struct Sweeps {
     tray: &'static Tray,
     /// Where the hand goes, and how fast.
     ways: VecDeque<(Vector3<f64>, f64)>,
+    /// The place of a cycle that comes next.
+    turn: usize,
 }
 
 impl Sweeps {
-    pub(crate) fn new(rng: ChaCha8Rng, script: &'static Script, tray: &'static Tray) -> Self {
-        Self { rng, script, tray, ways: VecDeque::new() }
+    pub(crate) fn new(mut rng: ChaCha8Rng, script: &'static Script, tray: &'static Tray) -> Self {
+        let turn = match &script.aim {
+            Aim::Objects { .. } => 0,
+            Aim::Cycle { places, .. } => rng.random_range(0..places.len()),
+        };
+        Self { rng, script, tray, ways: VecDeque::new(), turn }
     }
 
     /// A number of the normal distribution with this spread.
@@ -60,7 +68,10 @@ impl Sweeps {
         let mut left = period;
         while left > 1e-9 {
             let Some(&(goal, speed)) = self.ways.front() else {
-                self.plan(hand, objects, half_size);
+                match &self.script.aim {
+                    Aim::Objects { sweep } => self.plan(hand, objects, half_size, *sweep),
+                    Aim::Cycle { places, spread } => self.go_on(places, *spread),
+                }
                 continue;
             };
             let way = goal - hand;
@@ -77,8 +88,18 @@ impl Sweeps {
         hand
     }
 
-    fn plan(&mut self, hand: Vector3<f64>, objects: &[[f64; 3]], half_size: f64) {
-        let push = (0..TRIES).find_map(|attempt| self.push(objects, half_size, attempt));
+    /// To the next place of the cycle.
+    fn go_on(&mut self, places: &[[f64; 2]], spread: f64) {
+        let place = places[self.turn].map(|at| at + self.jitter(spread));
+        let [x, y] = self.tray.clamp(place, RIM_MARGIN);
+        let [slow, fast] = self.script.speed;
+        let speed = self.rng.random_range(slow..fast);
+        self.ways.push_back((Vector3::new(x, y, self.script.height), speed));
+        self.turn = (self.turn + 1) % places.len();
+    }
+
+    fn plan(&mut self, hand: Vector3<f64>, objects: &[[f64; 3]], half_size: f64, sweep: [f64; 2]) {
+        let push = (0..TRIES).find_map(|attempt| self.push(objects, half_size, sweep, attempt));
         let [slow, fast] = self.script.speed;
         let speed = self.rng.random_range(slow..fast);
         let (low, high) = (self.script.height, self.script.travel_height);
@@ -102,6 +123,7 @@ impl Sweeps {
         &mut self,
         objects: &[[f64; 3]],
         half_size: f64,
+        [least, most]: [f64; 2],
         attempt: usize,
     ) -> Option<([f64; 2], [f64; 2])> {
         let flat = |at: &[f64; 3]| Vector2::new(at[0], at[1]);
@@ -112,7 +134,6 @@ impl Sweeps {
             inwards.y.atan2(inwards.x) + self.jitter(SPREAD[0] + SPREAD[1] * attempt as f64);
         let along = Vector2::new(angle.cos(), angle.sin());
         let behind = object - along * self.rng.random_range(BEHIND[0]..BEHIND[1]);
-        let [least, most] = self.script.sweep;
         let beyond = object + along * self.rng.random_range(least..most);
         let start = clamp(behind, RIM_MARGIN);
         let end = clamp(beyond, RIM_MARGIN + RIM_HALF_SIZES * half_size);
@@ -159,7 +180,8 @@ mod tests {
         let mut through = 0;
         for seed in 0..50 {
             let mut sweeps = sweeps(Scene::Push1, seed);
-            sweeps.plan(Vector3::new(0.4, 0.0, 0.03), &OBJECTS, 0.035);
+            let Aim::Objects { sweep } = sweeps.script.aim else { panic!() };
+            sweeps.plan(Vector3::new(0.4, 0.0, 0.03), &OBJECTS, 0.035, sweep);
             let (end, _) = *sweeps.ways.back().unwrap();
             let (start, _) = sweeps.ways[sweeps.ways.len() - 2];
             let margin = RIM_MARGIN + RIM_HALF_SIZES * 0.035;
@@ -173,5 +195,33 @@ mod tests {
             through += usize::from(OBJECTS.iter().any(passes));
         }
         assert!(through >= 48, "{through} of 50 pushes go through an object");
+    }
+
+    #[test]
+    fn a_cycle_comes_back_to_its_places() {
+        let mut sweeps = sweeps(Scene::RollCycle, 3);
+        let Aim::Cycle { places, spread } = &sweeps.script.aim else { panic!() };
+        let first = sweeps.turn;
+        let mut hand = Vector3::new(0.5, 0.0, sweeps.script.height);
+        let mut visits = vec![];
+        while visits.len() < 40 {
+            let turn = sweeps.turn;
+            sweeps.go_on(places, *spread);
+            let (goal, _) = *sweeps.ways.back().unwrap();
+            visits.push((turn, goal));
+        }
+        for (number, (turn, goal)) in visits.iter().enumerate() {
+            assert_eq!(*turn, (first + number) % 4);
+            let miss = (goal.xy() - Vector2::from(places[*turn])).norm();
+            assert!(miss < 6.0 * spread, "{miss}");
+        }
+        // The hand passes all of them, in order.
+        for (_, goal) in &visits {
+            let passes = (0..100).any(|_| {
+                hand = sweeps.next(hand, &OBJECTS, 0.04, 0.01);
+                (hand - goal).norm() < 0.005
+            });
+            assert!(passes, "{goal}");
+        }
     }
 }

@@ -1,12 +1,16 @@
 //! `gatsbi observe`: recorded frames over the stream of the control loop, or one image.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::{SystemTime, UNIX_EPOCH},
+};
 
 use anyhow::Context as _;
 use clap::Args;
 use gatsbi_client::{
     Belief, Encoding, Image, Observation, Output, Selection, Session, SessionInfo,
 };
+use gatsbi_episodes::exchange::McapWriter;
 use image::RgbImage;
 use serde_json::json;
 
@@ -52,6 +56,9 @@ pub(crate) struct Arguments {
     /// Folder for a picture of each step: what the camera saw, the agent, the objects
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
+    /// MCAP file for the frames that are sent and the actions that led to them, with the times of sending
+    #[arg(long, value_name = "FILE", requires = "episode")]
+    record: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -95,7 +102,14 @@ pub(crate) async fn run(shared: &Shared, arguments: Arguments) -> anyhow::Result
     };
     let mut shown = Shown { shared, png: arguments.png.as_deref(), beliefs: Vec::new() };
     let done = if let Some(recording) = recording {
-        episode(&session, &selection, &recording, arguments.frames, &mut shown).await
+        let mut log = match &arguments.record {
+            Some(path) => Some(Log::create(path, &recording)?),
+            None => None,
+        };
+        let frames = arguments.frames;
+        let done = episode(&session, &selection, &recording, frames, log.as_mut(), &mut shown).await;
+        // What was sent before a failure is recorded as well.
+        log.map_or(Ok(()), Log::finish).and(done)
     } else {
         let step = arguments.step.unwrap_or(session.info().next_step);
         let observation = Observation { step, image, action: arguments.action };
@@ -111,6 +125,7 @@ async fn episode(
     selection: &Selection,
     recording: &Recording,
     frames: Option<Frames>,
+    mut log: Option<&mut Log>,
     shown: &mut Shown<'_>,
 ) -> anyhow::Result<()> {
     let next = session.info().next_step;
@@ -131,6 +146,9 @@ async fn episode(
     let mut stream = session.observe_stream(selection);
     let bar = bar(frames.len(), "frames", shown.shared.json);
     for (frame, step) in frames.zip(next..) {
+        if let Some(log) = &mut log {
+            log.add(recording, frame)?;
+        }
         let belief = stream.observe(recording.observation(frame, step)?).await?;
         let pixels = recording.episode.frame(frame).to_vec();
         shown.add(belief, RgbImage::from_raw(size.0, size.1, pixels))?;
@@ -138,6 +156,37 @@ async fn episode(
     }
     bar.finish_and_clear();
     Ok(())
+}
+
+/// A recording of what is sent.
+struct Log {
+    writer: McapWriter,
+    /// Nanoseconds.
+    last: u64,
+}
+
+impl Log {
+    fn create(path: &Path, recording: &Recording) -> anyhow::Result<Self> {
+        let writer = McapWriter::create(path, &recording.info, None)?;
+        Ok(Self { writer, last: 0 })
+    }
+
+    /// The action lies a nanosecond before its frame: it is what held since the frame before.
+    fn add(&mut self, recording: &Recording, frame: usize) -> anyhow::Result<()> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let now = u64::try_from(now.as_nanos()).unwrap_or(u64::MAX).max(self.last + 2);
+        if let Some(before) = frame.checked_sub(1) {
+            self.writer.action(now - 1, recording.episode.action(before))?;
+        }
+        let info = &recording.info;
+        self.writer.rgb(now, info.width, info.height, recording.episode.frame(frame))?;
+        self.last = now;
+        Ok(())
+    }
+
+    fn finish(self) -> anyhow::Result<()> {
+        Ok(self.writer.finish()?)
+    }
 }
 
 /// Beliefs on their way to the terminal, and their pictures.
