@@ -19,6 +19,8 @@ from PIL import Image, ImageDraw
 SHOWN = 8
 """Frames of a strip."""
 ZOOM = 2
+SOME = 2
+"""Goals reached, and goals missed, that are shown of an arm."""
 
 
 def interval(reached: int, goals: int) -> tuple[float, float]:
@@ -84,7 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Prints the table; draws the strips."""
     parse = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parse.add_argument("out", type=Path)
-    parse.add_argument("--strips", type=Path, help="picture of up to three goals reached and three missed by each arm")
+    parse.add_argument("--strips", type=Path, help="picture of some goals reached and missed by each arm")
     parse.add_argument("--common", action="store_true", help="only goals that every arm has pursued")
     given = parse.parse_args(arguments)
     arms = {
@@ -105,11 +107,11 @@ def main(arguments: list[str] | None = None) -> None:
     strips = []
     for arm, episodes in arms.items():
         for reached in (True, False):
-            for each in [each for each in episodes if each["reached"] == reached][:3]:
+            for each in [each for each in episodes if each["reached"] == reached][:SOME]:
                 said = "reached" if reached else f"{each['distance'] * 100:.0f} cm away at the end"
                 title = f"{arm}, goal {each['goal']}: {said} after {len(each['decisions'])} decisions"
                 strips.append(strip(given.out / arm, each["goal"], title))
-    Image.fromarray(np.concatenate(strips)).save(given.strips)
+    Image.fromarray(np.concatenate(strips)).save(given.strips, optimize=True)
 
 
 if __name__ == "__main__":
