@@ -107,7 +107,8 @@ pub(crate) async fn run(shared: &Shared, arguments: Arguments) -> anyhow::Result
             None => None,
         };
         let frames = arguments.frames;
-        let done = episode(&session, &selection, &recording, frames, log.as_mut(), &mut shown).await;
+        let done =
+            episode(&session, &selection, &recording, frames, log.as_mut(), &mut shown).await;
         // What was sent before a failure is recorded as well.
         log.map_or(Ok(()), Log::finish).and(done)
     } else {
