@@ -57,7 +57,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
     /// MCAP file for the frames that are sent and the actions that led to them, with the times of sending
-    #[arg(long, value_name = "FILE", requires = "episode")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["image", "dropped"])]
     record: Option<PathBuf>,
 }
 
