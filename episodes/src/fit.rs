@@ -58,7 +58,7 @@ impl Fit {
 }
 
 /// The largest centred square of a picture: its side, and where it begins from the left and from the top.
-pub fn centre_square((width, height): (u32, u32)) -> (u32, u32, u32) {
+fn centre_square((width, height): (u32, u32)) -> (u32, u32, u32) {
     let side = width.min(height);
     (side, (width - side) / 2, (height - side) / 2)
 }

@@ -67,7 +67,7 @@ mod writer;
 pub use clip::Clip;
 pub use episode::{Episode, EpisodeData};
 pub use error::{Error, InvalidEpisode, Result};
-pub use fit::{Fit, centre_square};
+pub use fit::Fit;
 pub use import_npz::{NpzImport, import_npz};
 pub use manifest::{Manifest, ShardEntry};
 pub use prefetch::{Prefetch, PrefetchOptions};

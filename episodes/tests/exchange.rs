@@ -25,7 +25,8 @@ fn fixture(name: &str) -> PathBuf {
 }
 
 fn sample() -> Dataset {
-    Dataset::open(Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/push1-heldout.parquet")).unwrap()
+    Dataset::open(Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/push1-heldout.parquet"))
+        .unwrap()
 }
 
 /// The frame of the fixtures, see `make.py`.
@@ -163,9 +164,9 @@ fn a_lerobot_data_set_is_imported() {
 
 #[test]
 fn frames_are_fitted_if_asked() {
-    let options =
-        ImportOptions { size: Some(3), fit: Fit::CentreCrop, ..ImportOptions::default() };
-    let dataset = lerobot(&fixture("lerobot"), &top(), &options).dataset();
+    let options = ImportOptions { size: Some(3), fit: Fit::CentreCrop, ..ImportOptions::default() };
+    let done = lerobot(&fixture("lerobot"), &top(), &options);
+    let dataset = done.dataset();
     assert_eq!((dataset.info().width, dataset.info().height), (3, 3));
     // Halved: blue is flat, red grows by 32 from the crop's first column on.
     let episode = dataset.read(0).unwrap();
@@ -184,7 +185,8 @@ fn a_lerobot_round_trip_loses_nothing_of_what_it_has_a_place_for() {
     let has_joints = dataset.read(0).unwrap().data().joint_positions.is_some();
     let joints = has_joints.then(|| "observation.state".to_owned());
     let source = LerobotSource { joints, ..LerobotSource::default() };
-    let back = lerobot(&root, &source, &ImportOptions::default()).dataset();
+    let done = lerobot(&root, &source, &ImportOptions::default());
+    let back = done.dataset();
     assert_same(&dataset, &back, |data| data.joint_positions.clone());
     let again = export_lerobot(&dataset, &root, &mut |_, _| ());
     assert!(matches!(again, Err(Error::NotEmpty { .. })), "{again:?}");
@@ -196,7 +198,8 @@ fn an_mcap_round_trip_loses_no_frame_and_no_action() {
     let folder = dir.path().join("mcap");
     export_mcap(&dataset, &folder, &mut |_, _| ()).unwrap();
     assert_eq!(fs_err::read_dir(&folder).unwrap().count(), 6);
-    let back = mcap(&folder, &McapSource::default()).dataset();
+    let done = mcap(&folder, &McapSource::default());
+    let back = done.dataset();
     assert_same(&dataset, &back, |_| None);
 }
 
@@ -227,7 +230,8 @@ fn videos_need_a_decoder_and_say_so() {
     let is_there = program.is_some_and(|program| {
         std::process::Command::new(program).arg("-version").output().is_ok()
     });
-    let done = lerobot(&fixture("lerobot-video"), &LerobotSource::default(), &ImportOptions::default());
+    let done =
+        lerobot(&fixture("lerobot-video"), &LerobotSource::default(), &ImportOptions::default());
     if is_there {
         let dataset = done.dataset();
         assert_eq!(dataset.len(), 2);
@@ -238,7 +242,10 @@ fn videos_need_a_decoder_and_say_so() {
                 let expected = [40 * t + 20, 100 * number + 20, 128];
                 let (pixels, _) = episode.frame(t).as_chunks::<3>();
                 for (found, expected) in pixels[16 * 32 + 16].iter().zip(expected) {
-                    assert!(usize::from(*found).abs_diff(expected) < 12, "{number} {t}: {found} {expected}");
+                    assert!(
+                        usize::from(*found).abs_diff(expected) < 12,
+                        "{number} {t}: {found} {expected}"
+                    );
                 }
             }
         }
@@ -274,7 +281,8 @@ fn ros2_pictures_and_commands_are_imported() {
                 action: Some(topic.into()),
                 field: field.map(str::to_owned),
             };
-            let dataset = mcap(&fixture("ros2.mcap"), &source).dataset();
+            let done = mcap(&fixture("ros2.mcap"), &source);
+            let dataset = done.dataset();
             is_fixture(&dataset.read(0).unwrap(), 0, 4, 2);
         }
     }
@@ -318,7 +326,8 @@ fn a_recording_is_written_as_it_happens_or_not_at_all() {
     drop(record());
     assert_eq!(fs_err::read_dir(dir.path()).unwrap().count(), 0);
     record().finish().unwrap();
-    let back = mcap(&path, &McapSource::default()).dataset();
+    let done = mcap(&path, &McapSource::default());
+    let back = done.dataset();
     let back = back.read(0).unwrap();
     assert_eq!(back.length(), 3);
     assert_eq!((back.frame(2), back.action(2)), (episode.frame(2), episode.action(2)));
@@ -329,11 +338,8 @@ fn a_cut_recording_is_refused_where_it_ends() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("cut.mcap");
     fs_err::copy(fixture("ros2.mcap"), &path).unwrap();
-    let source = McapSource {
-        camera: Some("/image".into()),
-        action: Some("/command".into()),
-        field: None,
-    };
+    let source =
+        McapSource { camera: Some("/image".into()), action: Some("/command".into()), field: None };
     for part in [4, 2] {
         cut(&path, length(&path) / part);
         let (file, row, _, problem) = mcap(&path, &source).problem();
@@ -366,7 +372,10 @@ fn robomimic_demonstrations_are_imported_in_their_order() {
 fn broken_hdf5_is_refused_by_data_set() {
     let source = Hdf5Source { camera: Some("wrist_image".into()), ..Hdf5Source::default() };
     let (file, row, column, problem) = hdf5(&fixture("robomimic.hdf5"), &source).problem();
-    assert_eq!((file.as_str(), row, column.as_deref()), ("robomimic.hdf5", Some(2), Some("wrist_image")));
+    assert_eq!(
+        (file.as_str(), row, column.as_deref()),
+        ("robomimic.hdf5", Some(2), Some("wrist_image"))
+    );
     assert!(problem.to_string().contains("there are agentview_image"), "{problem}");
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("cut.hdf5");
@@ -394,8 +403,10 @@ fn bair_records_are_imported() {
         }
     }
     assert_eq!(done.skipped(), ["{}/endeffector_pos", "{}/image_aux1/encoded"]);
-    let other = TfrecordSource { frames: "{}/image_aux1/encoded".into(), ..TfrecordSource::default() };
-    let dataset = tfrecord(&fixture("bair.tfrecord"), &other).dataset();
+    let other =
+        TfrecordSource { frames: "{}/image_aux1/encoded".into(), ..TfrecordSource::default() };
+    let done = tfrecord(&fixture("bair.tfrecord"), &other);
+    let dataset = done.dataset();
     assert_eq!(dataset.read(1).unwrap().frame(2), frame(1, 2, 1, HEIGHT, WIDTH));
 }
 
@@ -428,7 +439,10 @@ fn broken_lerobot_data_sets_are_refused_by_row_and_column() {
     let (file, _, column, problem) =
         lerobot(&fixture("lerobot"), &LerobotSource::default(), &options).problem();
     assert_eq!((file.as_str(), column.as_deref()), ("info.json", Some("observation.images")));
-    assert!(problem.to_string().contains("observation.images.top, observation.images.wrist"), "{problem}");
+    assert!(
+        problem.to_string().contains("observation.images.top, observation.images.wrist"),
+        "{problem}"
+    );
 
     let none = tempfile::tempdir().unwrap();
     let (file, ..) = lerobot(none.path(), &top(), &options).problem();

@@ -23,7 +23,7 @@ def test_a_recording_becomes_an_episode_byte_for_byte(frames, tmp_path):
     record(tmp_path / "run.mcap", frames)
     program = os.environ.get("GATSBI_EPISODES", "gatsbi-episodes")
     subprocess.run([program, "import", "mcap", tmp_path / "run.mcap", "--out", tmp_path / "data"], check=True)
-    row = pd.read_parquet(tmp_path / "data").iloc[0]
+    row = pd.read_parquet(tmp_path / "data/episodes-00000.parquet").iloc[0]
     assert row["rgb"] == frames[:4].tobytes()
     # Action t follows frame t; nothing follows the last, for which the one before still holds.
     held = [1, 2, 3, 3]

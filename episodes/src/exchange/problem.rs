@@ -1,7 +1,8 @@
 //! What can be wrong with a file of another format. Where it is wrong says [`Error::Import`](crate::Error::Import).
 
-use crate::{Error, InvalidEpisode};
 use std::path::Path;
+
+use crate::{Error, InvalidEpisode};
 
 /// Why something cannot be imported.
 #[derive(Debug, thiserror::Error)]

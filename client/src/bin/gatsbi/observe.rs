@@ -57,7 +57,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
     /// MCAP file for the frames that are sent and the actions that led to them, with the times of sending
-    #[arg(long, value_name = "FILE", requires = "episode")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["image", "dropped"])]
     record: Option<PathBuf>,
 }
 
@@ -107,7 +107,8 @@ pub(crate) async fn run(shared: &Shared, arguments: Arguments) -> anyhow::Result
             None => None,
         };
         let frames = arguments.frames;
-        let done = episode(&session, &selection, &recording, frames, log.as_mut(), &mut shown).await;
+        let done =
+            episode(&session, &selection, &recording, frames, log.as_mut(), &mut shown).await;
         // What was sent before a failure is recorded as well.
         log.map_or(Ok(()), Log::finish).and(done)
     } else {

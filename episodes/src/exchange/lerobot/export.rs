@@ -1,6 +1,10 @@
 //! Exports a data set as a LeRobotDataset v3.0 with its pictures in the table, as PNG: nothing is lost.
 
-use std::{collections::BTreeMap, path::Path, sync::Arc};
+use std::{
+    collections::{BTreeMap, HashMap},
+    path::Path,
+    sync::Arc,
+};
 
 use arrow_array::{
     ArrayRef, Float32Array, Int64Array, RecordBatch, StringArray, StructArray,
@@ -8,10 +12,8 @@ use arrow_array::{
 };
 use arrow_schema::{ArrowError, DataType, Field, Fields, Schema};
 use parquet::{
-    arrow::ArrowWriter,
-    basic::Compression,
-    errors::ParquetError,
-    file::{metadata::KeyValue, properties::WriterProperties},
+    arrow::ArrowWriter, basic::Compression, errors::ParquetError,
+    file::properties::WriterProperties,
 };
 use serde_json::{Value, json};
 
@@ -101,7 +103,7 @@ impl<'a> Export<'a> {
         let batch = batch.map_err(failed)?;
         let mut table = match self.table.take() {
             Some(table) => table,
-            None => create(&path, &batch.schema(), Vec::new())?,
+            None => create(&path, &batch.schema())?,
         };
         table.write(&batch).and_then(|()| table.flush()).map_err(failed)?;
         self.places.push(Place { length, table: self.tables, first: self.frames });
@@ -208,7 +210,7 @@ impl<'a> Export<'a> {
             table.close().map_err(|source| Error::Write { path, source })?;
         }
         let episodes = self.episodes().map_err(ParquetError::from);
-        self.write("meta/episodes/chunk-000/file-000.parquet", episodes, Vec::new())?;
+        self.write("meta/episodes/chunk-000/file-000.parquet", episodes)?;
         let tasks = RecordBatch::try_from_iter([
             ("task_index", integers([0])),
             ("__index_level_0__", Arc::new(StringArray::from(vec![TASK])) as ArrayRef),
@@ -222,8 +224,12 @@ impl<'a> Export<'a> {
                 {"name": null, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object", "metadata": null},
             ],
         });
-        let pandas = KeyValue::new("pandas".to_owned(), pandas.to_string());
-        self.write("meta/tasks.parquet", tasks.map_err(ParquetError::from), vec![pandas])?;
+        let tasks = tasks.and_then(|tasks| {
+            let metadata = HashMap::from([("pandas".to_owned(), pandas.to_string())]);
+            let schema = tasks.schema().as_ref().clone().with_metadata(metadata);
+            tasks.with_schema(Arc::new(schema))
+        });
+        self.write("meta/tasks.parquet", tasks.map_err(ParquetError::from))?;
         let statistics: serde_json::Map<String, Value> = self
             .statistics
             .iter()
@@ -314,16 +320,11 @@ impl<'a> Export<'a> {
         }
     }
 
-    fn write(
-        &self,
-        name: &str,
-        batch: Result<RecordBatch, ParquetError>,
-        metadata: Vec<KeyValue>,
-    ) -> Result<()> {
+    fn write(&self, name: &str, batch: Result<RecordBatch, ParquetError>) -> Result<()> {
         let path = self.root.join(name);
         let failed = |source| Error::Write { path: path.clone(), source };
         let batch = batch.map_err(failed)?;
-        let mut table = create(&path, &batch.schema(), metadata)?;
+        let mut table = create(&path, &batch.schema())?;
         table.write(&batch).map_err(failed)?;
         table.close().map_err(failed)?;
         Ok(())
@@ -349,11 +350,7 @@ fn name(folder: &str, table: usize) -> String {
     format!("{folder}/chunk-{:03}/file-{:03}.parquet", table / CHUNK, table % CHUNK)
 }
 
-fn create(
-    path: &Path,
-    schema: &Arc<Schema>,
-    metadata: Vec<KeyValue>,
-) -> Result<ArrowWriter<fs_err::File>> {
+fn create(path: &Path, schema: &Arc<Schema>) -> Result<ArrowWriter<fs_err::File>> {
     if let Some(folder) = path.parent() {
         fs_err::create_dir_all(folder)?;
     }
@@ -361,7 +358,6 @@ fn create(
     let properties = WriterProperties::builder()
         .set_compression(Compression::UNCOMPRESSED)
         .set_dictionary_enabled(false)
-        .set_key_value_metadata((!metadata.is_empty()).then_some(metadata))
         .build();
     let file = fs_err::File::create(path)?;
     ArrowWriter::try_new(file, Arc::clone(schema), Some(properties))

@@ -62,7 +62,10 @@ struct Chunk {
 impl fmt::Debug for McapWriter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { path, counts, .. } = self;
-        f.debug_struct("McapWriter").field("path", path).field("counts", counts).finish_non_exhaustive()
+        f.debug_struct("McapWriter")
+            .field("path", path)
+            .field("counts", counts)
+            .finish_non_exhaustive()
     }
 }
 
