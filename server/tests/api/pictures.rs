@@ -157,7 +157,7 @@ async fn the_live_page_needs_nothing_from_elsewhere() {
         assert!(!path.contains("//"), "{path} is elsewhere");
         let answer = server.get(&path).send().await.unwrap();
         assert_eq!(answer.status(), 200, "{path}");
-        if path.ends_with(".js") {
+        if answer.headers()["content-type"] == "text/javascript; charset=utf-8" {
             let script = answer.text().await.unwrap();
             for module in quoted(&script, " from \"./") {
                 let module = format!("/page/{module}");

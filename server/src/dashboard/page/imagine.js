@@ -185,7 +185,7 @@ export class Imagine {
         costs: this.costs(),
         sampling: { mode: "MODE_MEAN" },
         icem: { cem: { candidates: 16, iterations: 3, elites: 4 } },
-        budget_millis: 20000,
+        budget_millis: 30000,
       };
       const plan = await ask(`/v1/sessions/${this.about.id}/plans`, { body, signal: this.signal });
       const numbers = floats(plan.actions);
