@@ -329,21 +329,20 @@ impl Reader<'_> {
                 Some(video) => video.frame(number).map_err(|problem| at(number, problem))?,
                 None => None,
             };
-            let picture = match picture {
-                Some(picture) => picture,
-                None => {
-                    if !path.exists() {
-                        let (what, expected) =
-                            ("such file".into(), "the table of episodes names it".into());
-                        return Err(at(number, ImportProblem::Missing { what, expected }));
-                    }
-                    let mut video = Video::open(&path).map_err(|problem| at(number, problem))?;
-                    let picture = video.frame(number).map_err(|problem| at(number, problem))?;
-                    self.video = Some(video);
-                    match picture {
-                        Some(picture) => picture,
-                        None => break,
-                    }
+            let picture = if let Some(picture) = picture {
+                picture
+            } else {
+                if !path.exists() {
+                    let (what, expected) =
+                        ("such file".into(), "the table of episodes names it".into());
+                    return Err(at(number, ImportProblem::Missing { what, expected }));
+                }
+                let mut video = Video::open(&path).map_err(|problem| at(number, problem))?;
+                let picture = video.frame(number).map_err(|problem| at(number, problem))?;
+                self.video = Some(video);
+                match picture {
+                    Some(picture) => picture,
+                    None => break,
                 }
             };
             frames.push(picture).map_err(|problem| at(number, problem))?;

@@ -73,7 +73,7 @@ impl Table {
             let Some(batch) = read else { return Ok(None) };
             (self.batch, self.at) = (batch, 0);
         }
-        let row = Row { path: &self.path, batch: &self.batch, at: self.at, row: self.row };
+        let row = Row { path: &self.path, batch: &self.batch, at: self.at, place: self.row };
         self.at += 1;
         self.row += 1;
         Ok(Some(row))
@@ -86,7 +86,8 @@ pub(super) struct Row<'a> {
     path: &'a Path,
     batch: &'a RecordBatch,
     at: usize,
-    pub(super) row: u64,
+    /// In the file.
+    place: u64,
 }
 
 impl Row<'_> {
@@ -141,7 +142,7 @@ impl Row<'_> {
     }
 
     pub(super) fn problem(&self, column: &str, problem: ImportProblem) -> crate::Error {
-        problem.at(self.path, Some(self.row), Some(column))
+        problem.at(self.path, Some(self.place), Some(column))
     }
 
     fn column(&self, name: &str) -> Result<&ArrayRef> {

@@ -72,7 +72,7 @@ pub fn import_mcap(
         log.count_skipped(period, &mut skipped);
         let number = options.first_id.map(|first| first.saturating_add(index as u64));
         let id = number.or(log.episode_id).unwrap_or(index as u64);
-        log.recorded(id)
+        Ok(log.recorded(id))
     })?;
     let skipped = skipped
         .into_iter()
@@ -159,7 +159,7 @@ impl Log {
                         log.frames = Frames::new(log.sides, options.size, options.fit);
                     }
                 }
-                log.in_order(log.times.last(), message.log_time).map_err(at)?;
+                Self::in_order(log.times.last(), message.log_time).map_err(at)?;
                 log.frames.push(picture).map_err(at)?;
                 let (bytes, limit) = (log.frames.rgb.len(), MAX_COLUMN_BYTES);
                 if bytes > limit {
@@ -177,7 +177,7 @@ impl Log {
                     let what = "the number of values";
                     return Err(at(ImportProblem::Layout { what, found, expected }));
                 }
-                log.in_order(log.action_times.last(), message.log_time).map_err(at)?;
+                Self::in_order(log.action_times.last(), message.log_time).map_err(at)?;
                 log.action_times.push(message.log_time);
                 log.actions.push(command);
             } else {
@@ -201,7 +201,7 @@ impl Log {
         Ok(())
     }
 
-    fn in_order(&self, last: Option<&u64>, time: u64) -> Result<(), ImportProblem> {
+    fn in_order(last: Option<&u64>, time: u64) -> Result<(), ImportProblem> {
         match last {
             Some(&last) if last > time => Err(ImportProblem::Layout {
                 what: "the time",
@@ -259,7 +259,7 @@ impl Log {
         (0..self.times.len()).find(|&t| first < next(t)).unwrap_or(self.times.len())
     }
 
-    fn recorded(self, episode_id: u64) -> Result<Recorded> {
+    fn recorded(self, episode_id: u64) -> Recorded {
         let first = self.first_frame();
         let length = self.times.len() - first;
         let frame_bytes = self.frames.rgb.len() / self.times.len();
@@ -279,7 +279,7 @@ impl Log {
             ..EpisodeData::default()
         };
         let (frames_from, actions_from) = (self.camera_topic, self.action_topic);
-        Ok(Recorded { path: self.path, row: None, frames_from, actions_from, data })
+        Recorded { path: self.path, row: None, frames_from, actions_from, data }
     }
 }
 

@@ -193,20 +193,14 @@ impl Record {
     }
 
     fn missing(&self, found: Option<&Values>, expected: &str) -> ImportProblem {
-        match found {
-            Some(values) => ImportProblem::Layout {
-                what: "the feature",
-                found: values.described(),
-                expected: expected.into(),
-            },
-            None => {
-                let of_first = |key: &&String| key.starts_with("0/") || !key.contains('/');
-                let keys: Vec<_> =
-                    self.example.keys().filter(of_first).map(String::as_str).collect();
-                let expected = format!("there are {}", keys.join(", "));
-                ImportProblem::Missing { what: "such feature".into(), expected }
-            }
+        if let Some(values) = found {
+            let (what, found) = ("the feature", values.described());
+            return ImportProblem::Layout { what, found, expected: expected.into() };
         }
+        let of_first = |key: &&String| key.starts_with("0/") || !key.contains('/');
+        let keys: Vec<_> = self.example.keys().filter(of_first).map(String::as_str).collect();
+        let expected = format!("there are {}", keys.join(", "));
+        ImportProblem::Missing { what: "such feature".into(), expected }
     }
 
     fn at(&self, key: &str, problem: ImportProblem) -> crate::Error {
