@@ -58,11 +58,8 @@ fn taps(side: usize, pixels: usize, scale: f32, shift: f32) -> Vec<Tap> {
     // Rounded as libtorch rounds: crops of steep edges tell.
     let step = 2.0 / (side as f32 - 1.0).max(1.0);
     let tap = |i: usize| {
-        let edge = if i < side / 2 {
-            step * i as f32 - 1.0
-        } else {
-            1.0 - step * (side - i - 1) as f32
-        };
+        let edge =
+            if i < side / 2 { step * i as f32 - 1.0 } else { 1.0 - step * (side - i - 1) as f32 };
         let centre = edge * (side as f32 - 1.0) / side as f32;
         let at = (scale * centre + shift + 1.0) * (pixels as f32 / 2.0) - 0.5;
         let low = at.floor();
