@@ -244,6 +244,7 @@ impl Line<'_> {
     }
 
     #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "numbers of lanes and pixels, unrolled")]
     #[expect(unsafe_code, reason = "checks in the innermost loop would cost as much as it does")]
     fn tile<L: Lanes, const M: usize, const N: usize>(&self, first: usize, output: &mut [f32]) {
         // SAFETY: `Conv::run` has asserted that the last tile of the last image lies within the input; weights and

@@ -55,9 +55,13 @@ struct Tap {
 
 fn taps(side: usize, pixels: usize, scale: f32, shift: f32) -> Vec<Tap> {
     let last = pixels as f32 - 1.0;
+    // Rounded as libtorch rounds: crops of steep edges tell.
+    let step = 2.0 / (side as f32 - 1.0).max(1.0);
     let tap = |i: usize| {
-        let centre = (2 * i + 1) as f32 / side as f32 - 1.0;
-        let at = ((scale * centre + shift + 1.0) * pixels as f32 - 1.0) * 0.5;
+        let edge =
+            if i < side / 2 { step * i as f32 - 1.0 } else { 1.0 - step * (side - i - 1) as f32 };
+        let centre = edge * (side as f32 - 1.0) / side as f32;
+        let at = (scale * centre + shift + 1.0) * (pixels as f32 / 2.0) - 0.5;
         let low = at.floor();
         let share = at - low;
         let weight = |at: f32, weight: f32| if (0.0..=last).contains(&at) { weight } else { 0.0 };

@@ -62,14 +62,14 @@ pub(crate) enum Curve {
 /// Group normalisation.
 #[derive(Debug)]
 pub(crate) struct Groups {
-    groups: usize,
+    count: usize,
     weight: Vec<f32>,
     bias: Vec<f32>,
 }
 
 impl Groups {
     pub(crate) fn new(groups: i64, weight: &Tensor, bias: &Tensor) -> Self {
-        Self { groups: groups as usize, weight: numbers(weight), bias: numbers(bias) }
+        Self { count: groups as usize, weight: numbers(weight), bias: numbers(bias) }
     }
 }
 
@@ -168,8 +168,8 @@ fn bend_and_measure_in<L: Lanes>(
     affine: &mut [f32],
 ) {
     let channels = shape.channels;
-    let mut totals = vec![[0.0f64; 2]; norm.groups];
-    let width = channels / norm.groups;
+    let mut totals = vec![[0.0f64; 2]; norm.count];
+    let width = channels / norm.count;
     let (sums, squares) = affine.split_at_mut(channels);
     for row in shape.rows(image) {
         bend_row::<L>(row, curve);

@@ -237,7 +237,7 @@ impl Stack {
             (side, channels) = layer.output(side, channels);
             match runs.last_mut() {
                 Some(std::ops::Range { end, .. }) if !layer.is_heavy() && !after_heavy => {
-                    *end = i + 1
+                    *end = i + 1;
                 }
                 _ => runs.push(i..i + 1),
             }

@@ -128,13 +128,12 @@ impl MaskDecoder {
         let condition = Tensor::cat(&[z.narrow(1, 0, slots), action], -1);
         let condition = self.condition.forward(&condition); // [B, K-1, inputs]
         let x = condition.reshape([batch * slots, -1, 1, 1]);
-        let logits = match &self.frozen {
-            Some(stack) => kernels::enlarge_to(&stack.forward(&x), self.image_size, false),
-            None => {
-                let x = self.base.1.forward(&Activation::Celu.apply(&self.base.0.forward(&x)));
-                let x = self.stages.iter().fold(x, |x, stage| stage.forward(&x));
-                enlarge_to(self.output.forward(&x), self.image_size)
-            }
+        let logits = if let Some(stack) = &self.frozen {
+            kernels::enlarge_to(&stack.forward(&x), self.image_size, false)
+        } else {
+            let x = self.base.1.forward(&Activation::Celu.apply(&self.base.0.forward(&x)));
+            let x = self.stages.iter().fold(x, |x, stage| stage.forward(&x));
+            enlarge_to(self.output.forward(&x), self.image_size)
         };
         logits.view([batch, slots, 1, self.image_size, self.image_size])
     }
