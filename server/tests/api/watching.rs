@@ -65,6 +65,12 @@ fn same(told: &Json, number: f32) {
     assert_eq!((told.as_f64().unwrap() as f32).to_bits(), number.to_bits());
 }
 
+#[track_caller]
+fn near(told: &Json, number: f32) {
+    let told = told.as_f64().unwrap() as f32;
+    assert!((told - number).abs() <= 1e-3 * number.abs().max(1.0), "{told}, expected {number}");
+}
+
 fn same_objects(told: &Json, belief: &v1::Belief) {
     let objects = told["objects"].as_array().unwrap();
     assert_eq!(objects.len(), belief.objects.len());
@@ -119,11 +125,17 @@ async fn who_comes_late_is_shown_the_same_newest_step() {
         Feed::open(&server, &format!("/v1/sessions/{}/live?pictures=belief", session.id)).await;
     let told = feed.belief().await;
     assert_eq!((&told["step"], &told["camera"]), (&2.into(), &Json::Null));
-    // It was made once more, by the same model from the same belief.
-    assert_eq!(pixels(&told["belief"]), tensor(&last.outputs, v1::Output::Frame).data);
-    same_objects(&told, &last);
-    let surprise = floats(tensor(&last.outputs, v1::Output::Surprise))[0];
-    same(&told["surprise"], surprise);
+    // It was made once more, by the same model from the same belief, but in a block of bulk work: as equal as blocks of
+    // different sizes are.
+    let shown = pixels(&told["belief"]);
+    let seen = &tensor(&last.outputs, v1::Output::Frame).data;
+    let off = shown.iter().zip(seen).map(|(a, b)| a.abs_diff(*b)).max();
+    assert_eq!((shown.len(), off <= Some(1)), (seen.len(), true), "{off:?}");
+    for (told, object) in told["objects"].as_array().unwrap().iter().zip(&last.objects) {
+        assert_eq!(told["id"], object.id);
+        near(&told["x"], object.x);
+    }
+    near(&told["surprise"], floats(tensor(&last.outputs, v1::Output::Surprise))[0]);
 
     let dropped = v1::ObserveRequest {
         observation: Some(v1::Observation {

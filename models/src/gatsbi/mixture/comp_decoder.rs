@@ -274,7 +274,7 @@ mod tests {
     #[test]
     fn closed_first_convolution_equals_the_plain_one() {
         let config = presets::push1().mixture;
-        let mut store = ParamStore::new(4, Device::Cpu);
+        let mut store = ParamStore::new(3, Device::Cpu);
         let sizes = BroadcastSizes { inputs: 64, width: 32, final_kernel: 3 };
         let mut decoder = store.build(|root| BroadcastDecoder::new(root, &config, sizes, 64));
         let _no_grad = tch::no_grad_guard();
