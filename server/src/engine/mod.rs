@@ -40,7 +40,7 @@ use self::{
     models::{LoadedModel, ModelEntry, ModelId, Newcomer},
     scheduler::Sizes,
 };
-use crate::error::Error;
+use crate::{access::tenants::Share, error::Error};
 
 pub use self::door::DoorSizes;
 
@@ -71,6 +71,7 @@ pub struct Engine {
 pub struct Chunks {
     chunks: mpsc::Receiver<Result<Chunk, Failure>>,
     _outputs: OwnedSemaphorePermit,
+    _share: Share,
 }
 
 impl Chunks {
@@ -153,11 +154,17 @@ impl Engine {
         Ok(answer.await.map_err(gone)??)
     }
 
-    /// Starts a rollout that may give up to `output_bytes` of outputs.
+    /// Starts a rollout that may give up to `output_bytes` of outputs; its tenant's share is held as long as it is
+    /// under way.
     ///
     /// # Errors
     /// If too much is on its way already, or it cannot be done by its deadline.
-    pub async fn imagine(&self, job: Imagine, output_bytes: u64) -> Result<Chunks, Error> {
+    pub async fn imagine(
+        &self,
+        job: Imagine,
+        output_bytes: u64,
+        share: Share,
+    ) -> Result<Chunks, Error> {
         let (rows, steps) = (job.rows(), job.last_depth());
         let load = Load { rows, steps, output_bytes, deadline: job.deadline };
         let costs = &job.model.costs;
@@ -169,7 +176,7 @@ impl Engine {
         let (reply, chunks) = mpsc::channel(rows as usize * steps as usize + 1);
         let command = Command::Imagine(order(job, reply, ticket));
         self.commands.send(command).await.map_err(gone)?;
-        Ok(Chunks { chunks, _outputs: outputs })
+        Ok(Chunks { chunks, _outputs: outputs, _share: share })
     }
 }
 
