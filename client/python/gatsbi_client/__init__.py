@@ -9,14 +9,14 @@ from gatsbi_client._core import Retries
 from gatsbi_client._proto.gatsbi.v1.planning_service_pb2 import Cem, Icem, Mppi, RandomShooting
 from gatsbi_client._sync import Client, Handles, Session
 from gatsbi_client.errors import (
-    Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotFound, NotImplementedByServer,
-    Overloaded, ServerFailure, StepGap, Unavailable,
+    Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotAllowed, NotFound,
+    NotImplementedByServer, Overloaded, ServerFailure, StepGap, Unavailable,
 )
 from gatsbi_client.types import Belief, Chunk, Goal, Model, Plan, Prediction, PredictionPart, Rollout, Scores
 
 __all__ = [
     "AsyncClient", "AsyncHandles", "AsyncSession", "Belief", "Cem", "Chunk", "Client", "Conflict",
     "DeadlineExceeded", "FieldProblem", "GatsbiError", "Goal", "Handles", "Icem", "InvalidRequest", "Model", "Mppi",
-    "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "RandomShooting",
+    "NotAllowed", "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "RandomShooting",
     "Retries", "Rollout", "Scores", "ServerFailure", "Session", "StepGap", "Unavailable", "costs",
 ]
