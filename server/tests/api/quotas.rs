@@ -43,8 +43,7 @@ async fn a_tenant_takes_its_quota_and_no_more() {
     }
 
     let id = first["session"]["id"].as_str().unwrap();
-    let image =
-        json!({ "pixels": { "dtype": "DATA_TYPE_F32", "shape": [2, 2, 3], "values": vec![0.5; 12] } });
+    let image = json!({ "pixels": { "dtype": "DATA_TYPE_F32", "shape": [2, 2, 3], "values": vec![0.5; 12] } });
     let step = json!({ "observation": { "step": 0, "image": image, "action": vec![0.0; ACTION] } });
     let (status, seen) =
         post(&server, &small, &format!("/v1/sessions/{id}/observations"), step).await;
