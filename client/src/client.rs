@@ -15,11 +15,13 @@ use gatsbi_proto::v1::{
 use tokio::time::Instant;
 use tonic::{
     Code, Request, Response, Status,
+    service::interceptor::InterceptedService,
     transport::{Channel, Endpoint},
 };
 
 use crate::{
     Mode, Model, SessionInfo,
+    access::{ApiKey, Bearer, Tls},
     error::{Error, Result},
     session::Session,
 };
@@ -39,6 +41,10 @@ pub struct Options {
     pub max_message_bytes: usize,
     /// How calls are repeated.
     pub retries: Retries,
+    /// The key that the server asks for; none by default.
+    pub api_key: Option<ApiKey>,
+    /// How TLS is spoken, which a URL with `https://` needs; not by default.
+    pub tls: Option<Tls>,
 }
 
 /// How calls are repeated. Each pause is twice as long as the one before, up to a random part of itself longer, and
@@ -53,10 +59,13 @@ pub struct Retries {
     pub longest_pause: Duration,
 }
 
+/// A connection that shows the key.
+pub(crate) type Keyed = InterceptedService<Channel, Bearer>;
+
 /// A connection. Clones share it; a broken one is made anew by the next call.
 #[derive(Clone, Debug)]
 pub struct Client {
-    channel: Channel,
+    channel: Keyed,
     options: Options,
 }
 
@@ -90,6 +99,8 @@ impl Default for Options {
             keepalive: Duration::from_secs(10),
             max_message_bytes: 16 << 20,
             retries: Retries::default(),
+            api_key: None,
+            tls: None,
         }
     }
 }
@@ -105,7 +116,8 @@ impl Default for Retries {
 }
 
 impl Client {
-    /// Connects to `url`, such as `http://127.0.0.1:50051`; `http://` may be left out.
+    /// Connects to `url`, such as `http://127.0.0.1:50051`; `http://` may be left out, and so may `https://`, which it
+    /// is with [`Options::tls`].
     ///
     /// # Errors
     /// [`Error::Address`] and [`Error::Unreachable`].
@@ -122,7 +134,8 @@ impl Client {
             .connect()
             .await
             .map_err(|source| Error::Unreachable { url: url.to_owned(), source })?;
-        Ok(Self { channel, options })
+        let bearer = Bearer(options.api_key.clone());
+        Ok(Self { channel: InterceptedService::new(channel, bearer), options })
     }
 
     /// The models that the server serves, sorted by name.
@@ -226,17 +239,17 @@ impl Client {
         &self.options
     }
 
-    pub(crate) fn model_service(&self) -> ModelServiceClient<Channel> {
+    pub(crate) fn model_service(&self) -> ModelServiceClient<Keyed> {
         ModelServiceClient::new(self.channel.clone())
             .max_decoding_message_size(self.options.max_message_bytes)
     }
 
-    pub(crate) fn session_service(&self) -> SessionServiceClient<Channel> {
+    pub(crate) fn session_service(&self) -> SessionServiceClient<Keyed> {
         SessionServiceClient::new(self.channel.clone())
             .max_decoding_message_size(self.options.max_message_bytes)
     }
 
-    pub(crate) fn imagination_service(&self) -> ImaginationServiceClient<Channel> {
+    pub(crate) fn imagination_service(&self) -> ImaginationServiceClient<Keyed> {
         ImaginationServiceClient::new(self.channel.clone())
             .max_decoding_message_size(self.options.max_message_bytes)
     }
@@ -325,13 +338,20 @@ fn pause_asked(error: &Error, repeat: Repeat) -> Option<Duration> {
 
 fn endpoint(url: &str, options: &Options) -> Result<Endpoint> {
     let wrong = || Error::Address { url: url.to_owned() };
-    let whole = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+    let scheme = if options.tls.is_some() { "https" } else { "http" };
+    let whole = if url.contains("://") { url.to_owned() } else { format!("{scheme}://{url}") };
     let Ok(endpoint) = Endpoint::from_shared(whole) else { return Err(wrong()) };
     let uri = endpoint.uri();
-    if uri.scheme_str() != Some("http") || uri.host().is_none_or(str::is_empty) || uri.path() != "/"
+    if uri.scheme_str() != Some(scheme) || uri.host().is_none_or(str::is_empty) || uri.path() != "/"
     {
         return Err(wrong());
     }
+    let endpoint = match &options.tls {
+        Some(tls) => endpoint
+            .tls_config(tls.config())
+            .map_err(|source| Error::Unreachable { url: url.to_owned(), source })?,
+        None => endpoint,
+    };
     Ok(endpoint
         .connect_timeout(options.connect_timeout)
         .http2_keep_alive_interval(options.keepalive)

@@ -21,7 +21,9 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[non_exhaustive]
 pub enum Error {
     /// The URL is none that a server of this kind can have.
-    #[error("{url:?} is not the address of a server, expected http://HOST:PORT")]
+    #[error(
+        "{url:?} is not the address of a server, expected http://HOST:PORT, or with TLS https://HOST:PORT"
+    )]
     Address {
         /// What was given.
         url: String,

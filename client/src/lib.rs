@@ -45,6 +45,7 @@
 //! # }
 //! ```
 
+mod access;
 mod belief;
 mod client;
 mod error;
@@ -54,6 +55,7 @@ mod rollout;
 mod session;
 mod stream;
 
+pub use access::{ApiKey, Tls};
 pub use belief::Belief;
 pub use client::{Client, NewSession, Options, Retries};
 pub use error::{Code, Error, FieldProblem, Problem, Result};

@@ -6,7 +6,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use axum::serve::ListenerExt as _;
 use gatsbi_models::checkpoint::CheckpointError;
 use gatsbi_proto::v1::{
     FILE_DESCRIPTOR_SET,
@@ -15,18 +14,21 @@ use gatsbi_proto::v1::{
     planning_service_server::{self, PlanningServiceServer},
     session_service_server::{self, SessionServiceServer},
 };
-use tokio::{net::TcpListener, sync::watch, task::JoinSet};
+use tokio::{sync::watch, task::JoinSet};
 use tokio_util::sync::{CancellationToken, WaitForCancellationFutureOwned};
-use tonic::transport::{Server, server::TcpIncoming};
+use tonic::{service::Routes, transport::Server};
 
 use crate::{
+    access::{Access, gate::Gate, key_file::KeyFileError, need},
     api::{admin, grpc::Grpc, rest},
     checkpoints::Checkpoints,
     config::Config,
     engine::{Engine, EngineError, models::LoadedModel},
     error::told,
+    listener::Listener,
     service::Service,
     telemetry,
+    tls::{Tls, TlsError},
 };
 
 /// A running server.
@@ -38,6 +40,8 @@ pub struct App {
     pub http: SocketAddr,
     /// Where administration listens.
     pub admin: SocketAddr,
+    access: Option<Arc<Access>>,
+    tls: Option<Arc<Tls>>,
     stop: CancellationToken,
     ready: watch::Sender<Option<Arc<Service>>>,
     tasks: JoinSet<Result<(), String>>,
@@ -51,6 +55,12 @@ pub enum StartError {
     /// The configuration cannot be used.
     #[error("the configuration cannot be used: {}", .0.join("; "))]
     Config(Vec<String>),
+    /// Keys cannot be used.
+    #[error(transparent)]
+    Keys(#[from] KeyFileError),
+    /// Certificates cannot be used.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// A checkpoint cannot be loaded.
     #[error("a checkpoint cannot be loaded")]
     Checkpoint(#[from] CheckpointError),
@@ -72,6 +82,9 @@ pub enum StartError {
     /// The engine does not start.
     #[error("the engine does not start")]
     Engine(#[from] EngineError),
+    /// The description of the gRPC API cannot be served.
+    #[error("the description of the gRPC API cannot be served")]
+    Routes(#[source] tonic_reflection::server::Error),
     /// The start itself was cut off.
     #[error("the start was cut off")]
     CutOff(#[from] tokio::task::JoinError),
@@ -121,14 +134,28 @@ impl App {
         load: impl FnOnce(&Config) -> Result<Vec<LoadedModel>, StartError> + Send + 'static,
     ) -> Result<Self, StartError> {
         let metrics = telemetry::metrics();
+        let access = match &config.keys {
+            Some(path) => Some(Arc::new(Access::load(path, config.quota())?)),
+            None => None,
+        };
+        let tls = config.tls().map(Tls::load).transpose()?.map(Arc::new);
+        if access.is_some() && tls.is_none() && config.is_public() {
+            tracing::warn!(
+                "keys travel in the clear: --tls-certificate and --tls-key encrypt them"
+            );
+        }
         let stop = CancellationToken::new();
         let (ready, readiness) = watch::channel(None);
         let mut tasks = JoinSet::new();
 
-        let (admin, listener) = listen(config.admin_listen).await?;
-        tasks.spawn(http(listener, admin::router(readiness, metrics), &stop));
-        let (grpc, grpc_listener) = listen(config.grpc_listen).await?;
-        let (http, http_listener) = listen(config.http_listen).await?;
+        let (admin, listener) = listen(config.admin_listen, tls.as_ref()).await?;
+        let administration = admin::router(readiness, metrics);
+        let all = administration.clone();
+        let need = need::admin(config.open_metrics);
+        let gate = Gate::new(access.clone(), need, administration, move |_| all.clone());
+        tasks.spawn(http(listener, gate.into_router(), &stop));
+        let (grpc, grpc_listener) = listen(config.grpc_listen, tls.as_ref()).await?;
+        let (http, http_listener) = listen(config.http_listen, tls.as_ref()).await?;
 
         let drain = Duration::from_secs(config.drain_seconds);
         let (engine, models, thread, config) = tokio::task::spawn_blocking(move || {
@@ -148,11 +175,34 @@ impl App {
         });
 
         let service = Arc::new(Service::new(engine, models, &config, stop.clone()));
-        tasks.spawn(sweep(Arc::downgrade(&service), metrics, stop.clone()));
-        tasks.spawn(self::http(http_listener, rest::router(Arc::clone(&service)), &stop));
-        tasks.spawn(self::grpc(grpc_listener, Arc::clone(&service), stop.clone()));
+        let watched = (Arc::downgrade(&service), tls.clone());
+        tasks.spawn(sweep(watched, metrics, stop.clone()));
+        let of = Arc::clone(&service);
+        let gate = Gate::new(access.clone(), need::rest, rest::open(&service), move |owner| {
+            rest::router(Arc::new(of.of(owner)))
+        });
+        let router = gate.into_router();
+        tasks.spawn(self::http(http_listener, router, &stop));
+        let routes =
+            routes(Arc::clone(&service), access.clone()).await.map_err(StartError::Routes)?;
+        tasks.spawn(self::grpc(grpc_listener, routes, stop.clone()));
         ready.send_replace(Some(service));
-        Ok(Self { grpc, http, admin, stop, ready, tasks, engine_ended, drain })
+        Ok(Self { grpc, http, admin, access, tls, stop, ready, tasks, engine_ended, drain })
+    }
+
+    /// The keys in force, if there are any.
+    pub fn access(&self) -> Option<&Access> {
+        self.access.as_deref()
+    }
+
+    /// The certificates in force, if there are any.
+    pub fn tls(&self) -> Option<&Tls> {
+        self.tls.as_deref()
+    }
+
+    /// The service, while it serves.
+    pub(crate) fn service(&self) -> Option<Arc<Service>> {
+        self.ready.borrow().clone()
     }
 
     /// Waits until the engine has ended, which it should not while the server runs.
@@ -176,38 +226,37 @@ impl App {
     }
 }
 
-async fn listen(address: SocketAddr) -> Result<(SocketAddr, TcpListener), StartError> {
+async fn listen(
+    address: SocketAddr,
+    tls: Option<&Arc<Tls>>,
+) -> Result<(SocketAddr, Listener), StartError> {
     let failed = |source| StartError::Listen { address, source };
-    let listener = TcpListener::bind(address).await.map_err(failed)?;
-    Ok((listener.local_addr().map_err(failed)?, listener))
+    let listener = Listener::bind(address, tls.cloned()).await.map_err(failed)?;
+    Ok((axum::serve::Listener::local_addr(&listener).map_err(failed)?, listener))
 }
 
 fn http(
-    listener: TcpListener,
+    listener: Listener,
     router: axum::Router,
     stop: &CancellationToken,
 ) -> impl Future<Output = Result<(), String>> + use<> {
     let stopped: WaitForCancellationFutureOwned = stop.clone().cancelled_owned();
-    let listener = listener.tap_io(|stream| {
-        // Answers are small and awaited.
-        stream.set_nodelay(true).ok();
-    });
     async move {
         let serving = axum::serve(listener, router).with_graceful_shutdown(stopped);
         serving.await.map_err(|error| error.to_string())
     }
 }
 
-async fn grpc(
-    listener: TcpListener,
+/// The gRPC services behind their gate: health for everybody, all else over what is the tenant's own.
+async fn routes(
     service: Arc<Service>,
-    stop: CancellationToken,
-) -> Result<(), String> {
-    let (health, health_service) = tonic_health::server::health_reporter();
-    health.set_serving::<ModelServiceServer<Grpc>>().await;
-    health.set_serving::<SessionServiceServer<Grpc>>().await;
-    health.set_serving::<ImaginationServiceServer<Grpc>>().await;
-    health.set_serving::<PlanningServiceServer<Grpc>>().await;
+    access: Option<Arc<Access>>,
+) -> Result<axum::Router, tonic_reflection::server::Error> {
+    let (reporter, health) = tonic_health::server::health_reporter();
+    reporter.set_serving::<ModelServiceServer<Grpc>>().await;
+    reporter.set_serving::<SessionServiceServer<Grpc>>().await;
+    reporter.set_serving::<ImaginationServiceServer<Grpc>>().await;
+    reporter.set_serving::<PlanningServiceServer<Grpc>>().await;
     let reflection = tonic_reflection::server::Builder::configure()
         .register_encoded_file_descriptor_set(FILE_DESCRIPTOR_SET)
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
@@ -215,31 +264,43 @@ async fn grpc(
         .with_service_name(session_service_server::SERVICE_NAME)
         .with_service_name(imagination_service_server::SERVICE_NAME)
         .with_service_name(planning_service_server::SERVICE_NAME)
-        .build_v1()
-        .map_err(|error| error.to_string())?;
+        .build_v1()?;
+    let open = Routes::new(health.clone()).into_axum_router();
     let limit = service.limits().max_request_bytes as usize;
-    let grpc = Grpc(service);
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let routes_of = move |owner| {
+        let grpc = Grpc(Arc::new(service.of(owner)));
+        let imagination = ImaginationServiceServer::new(grpc.clone());
+        Routes::new(health.clone())
+            .add_service(reflection.clone())
+            .add_service(ModelServiceServer::new(grpc.clone()))
+            .add_service(SessionServiceServer::new(grpc.clone()).max_decoding_message_size(limit))
+            .add_service(imagination.max_decoding_message_size(limit))
+            .add_service(PlanningServiceServer::new(grpc).max_decoding_message_size(limit))
+            .into_axum_router()
+    };
+    Ok(Gate::new(access, need::grpc, open, routes_of).into_router())
+}
+
+async fn grpc(
+    listener: Listener,
+    routes: axum::Router,
+    stop: CancellationToken,
+) -> Result<(), String> {
     Server::builder()
         // One frame of a camera should not wait for a window update.
         .initial_stream_window_size(4 << 20)
         .initial_connection_window_size(16 << 20)
         .http2_keepalive_interval(Some(Duration::from_secs(30)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
-        .add_service(health_service)
-        .add_service(reflection)
-        .add_service(ModelServiceServer::new(grpc.clone()))
-        .add_service(SessionServiceServer::new(grpc.clone()).max_decoding_message_size(limit))
-        .add_service(ImaginationServiceServer::new(grpc.clone()).max_decoding_message_size(limit))
-        .add_service(PlanningServiceServer::new(grpc).max_decoding_message_size(limit))
-        .serve_with_incoming_shutdown(incoming, stop.cancelled_owned())
+        .add_routes(Routes::from(routes))
+        .serve_with_incoming_shutdown(Box::pin(listener.into_stream()), stop.cancelled_owned())
         .await
         .map_err(|error| error.to_string())
 }
 
 /// Every second: closes expired sessions and keeps the metrics fresh.
 async fn sweep(
-    service: std::sync::Weak<Service>,
+    (service, tls): (std::sync::Weak<Service>, Option<Arc<Tls>>),
     metrics: &'static metrics_exporter_prometheus::PrometheusHandle,
     stop: CancellationToken,
 ) -> Result<(), String> {
@@ -252,6 +313,9 @@ async fn sweep(
         let Some(service) = service.upgrade() else { return Ok(()) };
         let (count, bytes) = service.sweep(Instant::now());
         telemetry::sessions(count, bytes);
+        if let Some(tls) = &tls {
+            telemetry::certificate_ends(tls.ends());
+        }
         metrics.run_upkeep();
     }
 }

@@ -1,12 +1,20 @@
-//! What an operator can set: flags and environment, their defaults, and what is wrong with them.
+//! What an operator can set, the defaults, and what is wrong with it.
+//!
+//! A setting is a flag, a variable of the environment, and a line of a file, in this order ([`layers`]); [`render`]
+//! writes such a file.
+
+pub mod layers;
+pub mod render;
 
 use std::{net::SocketAddr, path::PathBuf, str::FromStr, time::Duration};
 
 use clap::Parser;
 
 use crate::{
+    access::tenants::Quota,
     checkpoints::Checkpoints,
     engine::{DoorSizes, EngineConfig, scheduler::Sizes},
+    tls::TlsFiles,
 };
 
 /// Serves GATSBI world models to robot agents over gRPC and REST.
@@ -15,115 +23,205 @@ use crate::{
 pub struct Config {
     /// Checkpoint to serve, as PATH or NAME=PATH; may be given several times. A card beside it (the same name with
     /// the extension .md) is served with it.
-    #[arg(long = "checkpoint", env = "GATSBI_CHECKPOINTS", value_delimiter = ',')]
+    #[arg(
+        long = "checkpoint",
+        env = "GATSBI_CHECKPOINTS",
+        value_name = "[NAME=]PATH",
+        value_delimiter = ',',
+        help_heading = "Models"
+    )]
     pub checkpoints: Vec<CheckpointArg>,
 
     /// Folder of checkpoints: all that are in it are served, and relative paths of models that are loaded later start
     /// there.
-    #[arg(long, env = "GATSBI_CHECKPOINT_FOLDER")]
+    #[arg(long, env = "GATSBI_CHECKPOINT_FOLDER", value_name = "PATH", help_heading = "Models")]
     pub checkpoint_folder: Option<PathBuf>,
 
     /// Where models compute: cpu, or cuda:N.
-    #[arg(long, env = "GATSBI_DEVICE", default_value = "cpu")]
+    #[arg(long, env = "GATSBI_DEVICE", default_value = "cpu", help_heading = "Models")]
     pub device: DeviceArg,
 
     /// Address of the gRPC API.
-    #[arg(long, env = "GATSBI_GRPC_LISTEN", default_value = "127.0.0.1:50051")]
+    #[arg(
+        long,
+        env = "GATSBI_GRPC_LISTEN",
+        default_value = "127.0.0.1:50051",
+        help_heading = "Listeners"
+    )]
     pub grpc_listen: SocketAddr,
 
     /// Address of the REST API.
-    #[arg(long, env = "GATSBI_HTTP_LISTEN", default_value = "127.0.0.1:8080")]
+    #[arg(
+        long,
+        env = "GATSBI_HTTP_LISTEN",
+        default_value = "127.0.0.1:8080",
+        help_heading = "Listeners"
+    )]
     pub http_listen: SocketAddr,
 
-    /// Address of administration: health, metrics, models. Whoever reaches it may use it.
-    #[arg(long, env = "GATSBI_ADMIN_LISTEN", default_value = "127.0.0.1:9090")]
+    /// Address of administration: health, metrics, models. Without keys, whoever reaches it may use it.
+    #[arg(
+        long,
+        env = "GATSBI_ADMIN_LISTEN",
+        default_value = "127.0.0.1:9090",
+        help_heading = "Listeners"
+    )]
     pub admin_listen: SocketAddr,
 
-    /// Allows addresses other than the loopback. There are no keys yet: whoever reaches them may use them.
-    #[arg(long, env = "GATSBI_ALLOW_PUBLIC")]
+    /// Allows addresses other than the loopback without keys and without certificates of clients: whoever reaches them
+    /// may use them.
+    #[arg(long, env = "GATSBI_ALLOW_PUBLIC", help_heading = "Listeners")]
     pub allow_public: bool,
+
+    /// File of keys, which only its owner may read; with it every request needs a key. `gatsbi-server keys new` makes
+    /// one. SIGHUP has it read again.
+    #[arg(long, env = "GATSBI_KEYS", value_name = "PATH", help_heading = "Access")]
+    pub keys: Option<PathBuf>,
+
+    /// Certificate of the server with those between it and its authority, as PEM; with it every listener speaks TLS
+    /// alone. SIGHUP has it read again.
+    #[arg(long, env = "GATSBI_TLS_CERTIFICATE", value_name = "PATH", help_heading = "Access")]
+    pub tls_certificate: Option<PathBuf>,
+
+    /// Private key of the certificate, as PEM.
+    #[arg(long, env = "GATSBI_TLS_KEY", value_name = "PATH", help_heading = "Access")]
+    pub tls_key: Option<PathBuf>,
+
+    /// Authorities, as PEM; with them a client must show a certificate that one of them has signed (mutual TLS).
+    #[arg(long, env = "GATSBI_TLS_CLIENT_CA", value_name = "PATH", help_heading = "Access")]
+    pub tls_client_ca: Option<PathBuf>,
+
+    /// Lets /metrics be read without a key.
+    #[arg(long, env = "GATSBI_OPEN_METRICS", help_heading = "Access")]
+    pub open_metrics: bool,
+
+    /// Open sessions of a tenant, where the file of keys says nothing else; no limit of its own if absent.
+    #[arg(long, env = "GATSBI_TENANT_MAX_SESSIONS", value_name = "N", help_heading = "Access")]
+    pub tenant_max_sessions: Option<u64>,
+
+    /// Rows of rollouts that a tenant may have under way, likewise.
+    #[arg(long, env = "GATSBI_TENANT_MAX_ROWS", value_name = "N", help_heading = "Access")]
+    pub tenant_max_rows: Option<u64>,
+
+    /// What a tenant may keep (earlier steps, frames, goals, handles), in MiB, likewise.
+    #[arg(long, env = "GATSBI_TENANT_MAX_KEPT_MIB", value_name = "N", help_heading = "Access")]
+    pub tenant_max_kept_mib: Option<u64>,
 
     /// CPU threads of one operation. More than there are idle cores makes every step slower; 0 takes half of the
     /// cores.
-    #[arg(long, env = "GATSBI_THREADS", default_value_t = 0)]
+    #[arg(long, env = "GATSBI_THREADS", default_value_t = 0, help_heading = "Engine")]
     pub threads: usize,
 
     /// Rows of an observe block. 1 answers a lone robot fastest; a GPU wants 16 or so. Changing it changes answers
     /// in their last bits.
-    #[arg(long, env = "GATSBI_OBSERVE_BLOCK", default_value_t = 1)]
+    #[arg(long, env = "GATSBI_OBSERVE_BLOCK", default_value_t = 1, help_heading = "Engine")]
     pub observe_block: usize,
 
     /// Rows of an imagine block; rollouts of fewer rows are padded. Changing it changes answers in their last bits.
-    #[arg(long, env = "GATSBI_IMAGINE_BLOCK", default_value_t = 8)]
+    #[arg(long, env = "GATSBI_IMAGINE_BLOCK", default_value_t = 8, help_heading = "Engine")]
     pub imagine_block: usize,
 
     /// How long rollouts may keep an observation waiting, in milliseconds; one block is always computed.
-    #[arg(long, env = "GATSBI_TICK_MILLIS", default_value_t = 20)]
+    #[arg(long, env = "GATSBI_TICK_MILLIS", default_value_t = 20, help_heading = "Engine")]
     pub tick_millis: u64,
 
     /// Rows of rollouts that are on their way at once, at least two blocks.
-    #[arg(long, env = "GATSBI_ARENA_ROWS", default_value_t = 512)]
+    #[arg(long, env = "GATSBI_ARENA_ROWS", default_value_t = 512, help_heading = "Engine")]
     pub arena_rows: usize,
 
     /// Observations that may wait for the model; more are refused.
-    #[arg(long, env = "GATSBI_MAX_OBSERVES", default_value_t = 256)]
+    #[arg(long, env = "GATSBI_MAX_OBSERVES", default_value_t = 256, help_heading = "Limits")]
     pub max_observes: usize,
 
     /// Rows (candidates times samples) of all rollouts that may wait; more are refused.
-    #[arg(long, env = "GATSBI_MAX_ROWS", default_value_t = 16_384)]
+    #[arg(long, env = "GATSBI_MAX_ROWS", default_value_t = 16_384, help_heading = "Limits")]
     pub max_rows: usize,
 
     /// Outputs of all rollouts that may wait to be fetched, in MiB; more are refused.
-    #[arg(long, env = "GATSBI_MAX_OUTPUT_MIB", default_value_t = 1024)]
+    #[arg(long, env = "GATSBI_MAX_OUTPUT_MIB", default_value_t = 1024, help_heading = "Limits")]
     pub max_output_mib: u64,
 
     /// Rows of one rollout.
-    #[arg(long, env = "GATSBI_MAX_REQUEST_ROWS", default_value_t = 4096)]
+    #[arg(long, env = "GATSBI_MAX_REQUEST_ROWS", default_value_t = 4096, help_heading = "Limits")]
     pub max_request_rows: u32,
 
     /// Outputs of one rollout, in MiB.
-    #[arg(long, env = "GATSBI_MAX_REQUEST_OUTPUT_MIB", default_value_t = 256)]
+    #[arg(
+        long,
+        env = "GATSBI_MAX_REQUEST_OUTPUT_MIB",
+        default_value_t = 256,
+        help_heading = "Limits"
+    )]
     pub max_request_output_mib: u64,
 
     /// Candidates of one rollout.
-    #[arg(long, env = "GATSBI_MAX_CANDIDATES", default_value_t = 4096)]
+    #[arg(long, env = "GATSBI_MAX_CANDIDATES", default_value_t = 4096, help_heading = "Limits")]
     pub max_candidates: u32,
 
     /// Steps of one rollout.
-    #[arg(long, env = "GATSBI_MAX_HORIZON", default_value_t = 256)]
+    #[arg(long, env = "GATSBI_MAX_HORIZON", default_value_t = 256, help_heading = "Limits")]
     pub max_horizon: u32,
 
     /// Samples of one rollout.
-    #[arg(long, env = "GATSBI_MAX_SAMPLES", default_value_t = 256)]
+    #[arg(long, env = "GATSBI_MAX_SAMPLES", default_value_t = 256, help_heading = "Limits")]
     pub max_samples: u32,
 
     /// Width and height of an image that is sent, in pixels.
-    #[arg(long, env = "GATSBI_MAX_IMAGE_SIDE", default_value_t = 4096)]
+    #[arg(long, env = "GATSBI_MAX_IMAGE_SIDE", default_value_t = 4096, help_heading = "Limits")]
     pub max_image_side: u32,
 
     /// Size of a request, in MiB.
-    #[arg(long, env = "GATSBI_MAX_REQUEST_MIB", default_value_t = 16)]
+    #[arg(long, env = "GATSBI_MAX_REQUEST_MIB", default_value_t = 16, help_heading = "Limits")]
     pub max_request_mib: usize,
 
     /// Sessions that are kept; more are refused.
-    #[arg(long, env = "GATSBI_MAX_SESSIONS", default_value_t = 10_000)]
+    #[arg(long, env = "GATSBI_MAX_SESSIONS", default_value_t = 10_000, help_heading = "Limits")]
     pub max_sessions: usize,
 
     /// Earlier steps and frames that sessions keep, and rows of handles, in MiB; more are refused.
-    #[arg(long, env = "GATSBI_MAX_KEPT_MIB", default_value_t = 1024)]
+    #[arg(long, env = "GATSBI_MAX_KEPT_MIB", default_value_t = 1024, help_heading = "Limits")]
     pub max_kept_mib: u64,
 
     /// How long a session may lie unused, in seconds.
-    #[arg(long, env = "GATSBI_SESSION_TTL_SECONDS", default_value_t = 3600)]
+    #[arg(
+        long,
+        env = "GATSBI_SESSION_TTL_SECONDS",
+        default_value_t = 3600,
+        help_heading = "Limits"
+    )]
     pub session_ttl_seconds: u64,
 
     /// How long requests may take to finish after SIGINT or SIGTERM, in seconds.
-    #[arg(long, env = "GATSBI_DRAIN_SECONDS", default_value_t = 10)]
+    #[arg(long, env = "GATSBI_DRAIN_SECONDS", default_value_t = 10, help_heading = "Operation")]
     pub drain_seconds: u64,
 
     /// What is logged, such as info or gatsbi_server=debug.
-    #[arg(long, env = "GATSBI_LOG", default_value = "info")]
+    #[arg(long, env = "GATSBI_LOG", default_value = "info", help_heading = "Operation")]
     pub log: String,
+
+    /// How logs are written: text, or json, an object a line.
+    #[arg(
+        long,
+        env = "GATSBI_LOG_FORMAT",
+        value_enum,
+        default_value = "text",
+        help_heading = "Operation"
+    )]
+    pub log_format: LogFormat,
+
+    /// Collector of traces (OTLP over gRPC), such as http://127.0.0.1:4317; none are sent if absent. Needs a server
+    /// that was built with the feature otel.
+    #[arg(long, env = "GATSBI_OTLP_ENDPOINT", value_name = "URL", help_heading = "Operation")]
+    pub otlp_endpoint: Option<String>,
+}
+
+/// How logs are written.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, clap::ValueEnum)]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// For machines.
+    Json,
 }
 
 /// A checkpoint with the name to serve it under.
@@ -197,13 +295,49 @@ impl Config {
             ("--http-listen", self.http_listen),
             ("--admin-listen", self.admin_listen),
         ] {
+            let guarded = self.keys.is_some() || self.tls_client_ca.is_some();
             check(
-                self.allow_public || address.ip().is_loopback(),
+                guarded || self.allow_public || address.ip().is_loopback(),
                 format!(
-                    "{flag} {address} can be reached from other machines; --allow-public says that this is meant"
+                    "{flag} {address} can be reached from other machines, and whoever reaches it may use it; --keys \
+                     asks for keys, and --allow-public says that none is needed"
                 ),
             );
         }
+        check(
+            self.tls_certificate.is_some() == self.tls_key.is_some(),
+            "--tls-certificate and --tls-key must be given together".to_owned(),
+        );
+        check(
+            self.tls_client_ca.is_none() || self.tls_certificate.is_some(),
+            "--tls-client-ca needs --tls-certificate and --tls-key".to_owned(),
+        );
+        let quota = [
+            ("--tenant-max-sessions", self.tenant_max_sessions),
+            ("--tenant-max-rows", self.tenant_max_rows),
+            ("--tenant-max-kept-mib", self.tenant_max_kept_mib),
+        ];
+        for (flag, limit) in quota {
+            check(limit != Some(0), format!("{flag} is 0, expected at least 1"));
+            check(
+                limit.is_none() || self.keys.is_some(),
+                format!("{flag} needs --keys: without keys there are no tenants"),
+            );
+        }
+        let ports = [self.grpc_listen, self.http_listen, self.admin_listen];
+        for (at, address) in ports.iter().enumerate() {
+            check(
+                address.port() == 0 || !ports[..at].contains(address),
+                format!("two listeners have the address {address}"),
+            );
+        }
+        if let Err(error) = tracing_subscriber::EnvFilter::try_new(&self.log) {
+            check(false, format!("--log is {:?}: {error}", self.log));
+        }
+        check(
+            cfg!(feature = "otel") || self.otlp_endpoint.is_none(),
+            "--otlp-endpoint needs a server that was built with the feature otel".to_owned(),
+        );
         for (flag, value, range) in [
             ("--threads", self.threads, 0..=1024),
             ("--observe-block", self.observe_block, 1..=1024),
@@ -226,6 +360,7 @@ impl Config {
             ("--max-sessions", self.max_sessions, 1..=1 << 24),
             ("--max-kept-mib", self.max_kept_mib as usize, 1..=1 << 20),
             ("--session-ttl-seconds", self.session_ttl_seconds as usize, 1..=1 << 30),
+            ("--drain-seconds", self.drain_seconds as usize, 0..=3600),
         ] {
             check(
                 range.contains(&value),
@@ -240,6 +375,30 @@ impl Config {
             );
         }
         problems
+    }
+
+    /// Whether other machines can reach a listener.
+    pub fn is_public(&self) -> bool {
+        let all = [self.grpc_listen, self.http_listen, self.admin_listen];
+        all.iter().any(|address| !address.ip().is_loopback())
+    }
+
+    /// Where certificates are, if there are any.
+    pub fn tls(&self) -> Option<TlsFiles> {
+        Some(TlsFiles {
+            certificate: self.tls_certificate.clone()?,
+            key: self.tls_key.clone()?,
+            client_ca: self.tls_client_ca.clone(),
+        })
+    }
+
+    /// What a tenant may take, unless the file of keys says something else.
+    pub fn quota(&self) -> Quota {
+        Quota {
+            sessions: self.tenant_max_sessions.unwrap_or(u64::MAX),
+            rows: self.tenant_max_rows.unwrap_or(u64::MAX),
+            kept_bytes: self.tenant_max_kept_mib.map_or(u64::MAX, |mib| mib << 20),
+        }
     }
 
     /// Where checkpoints come from, and where they go.

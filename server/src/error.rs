@@ -60,6 +60,31 @@ pub enum Error {
         /// The limit.
         limit_bytes: usize,
     },
+    /// A request without a key, where one is needed.
+    #[error("a key is needed: Authorization: Bearer KEY")]
+    NoKey,
+    /// A key that nobody has.
+    #[error("the key is not known")]
+    WrongKey,
+    /// A key that was good once.
+    #[error("the key has expired")]
+    ExpiredKey,
+    /// A key that is not good for this.
+    #[error("this needs a key with the role {needs} or a higher one, and the key's role is {role}")]
+    RoleTooLow {
+        /// The key's role.
+        role: &'static str,
+        /// The lowest that would do.
+        needs: &'static str,
+    },
+    /// More than a tenant may take.
+    #[error("this tenant may have no more than {limit} {what}")]
+    QuotaExceeded {
+        /// What there is too much of.
+        what: &'static str,
+        /// How much there may be.
+        limit: u64,
+    },
     /// A session that does not exist, or no longer.
     #[error("there is no session {id}")]
     UnknownSession {
@@ -323,6 +348,10 @@ impl Error {
             | Self::TooManySessions { retry_after, .. }
             | Self::TooMuchKept { retry_after, .. } => Some(*retry_after),
             Self::TooSlow { retry_after, .. } => *retry_after,
+            // Rows come back by themselves, all else when it is given back.
+            Self::QuotaExceeded { what, .. } => {
+                what.starts_with("rows").then_some(Duration::from_secs(1))
+            }
             Self::Starting | Self::ShuttingDown => Some(Duration::from_secs(1)),
             _ => None,
         }

@@ -3,16 +3,22 @@
 #![expect(clippy::print_stdout, reason = "where it listens is what the program has to say")]
 
 use std::{
-    io::IsTerminal as _,
+    ffi::OsString,
     os::unix::process::CommandExt as _,
     process::{Command, ExitCode},
 };
 
-use anyhow::Context as _;
-use clap::Parser as _;
+use clap::{Arg, ArgAction, Args as _, CommandFactory as _, FromArgMatches as _, Subcommand as _};
 use gatsbi_server::{
+    access::command::{KeysTask, Task},
     app::{self, App},
-    config::Config,
+    config::{
+        Config,
+        layers::{self, Layered, Source, Unusable},
+        render::{Style, render},
+    },
+    logs::Logs,
+    reload,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -20,25 +26,51 @@ use tokio::signal::unix::{SignalKind, signal};
 /// shared core down fourfold.
 const OPENMP: [(&str, &str); 2] = [("GOMP_SPINCOUNT", "0"), ("OMP_WAIT_POLICY", "PASSIVE")];
 
+/// What cannot be started because it was told wrong.
+const MISTAKEN: u8 = 2;
+
 fn main() -> ExitCode {
-    if let Err(error) = with_openmp_settings() {
-        eprintln!("warning: libgomp keeps its own settings: {error}");
-    }
-    let config = Config::parse();
-    let problems = config.problems();
-    if !problems.is_empty() {
-        for problem in problems {
-            eprintln!("error: {problem}");
+    let layered = match configuration() {
+        Ok(layered) => layered,
+        Err(Unusable::Told(told)) => told.exit(),
+        Err(Unusable::Problems(problems)) => {
+            for problem in problems {
+                eprintln!("error: {problem}");
+            }
+            return ExitCode::from(MISTAKEN);
         }
-        return ExitCode::from(2);
-    }
-    match run(config) {
+    };
+    let done = match Task::from_arg_matches(&layered.matches) {
+        Ok(Task::Keys(KeysTask::New(new))) => {
+            new.make().map(|shown| print!("{shown}")).map_err(anyhow::Error::from)
+        }
+        Err(_no_task) if layered.matches.get_flag("print_config") => {
+            print!("{}", render(&layered.matches, Style::Effective));
+            Ok(())
+        }
+        Err(_no_task) => {
+            if let Err(error) = with_openmp_settings() {
+                eprintln!("warning: libgomp keeps its own settings: {error}");
+            }
+            run(layered)
+        }
+    };
+    match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE
         }
     }
+}
+
+fn configuration() -> Result<Layered, Unusable> {
+    let arguments: Vec<OsString> = std::env::args_os().collect();
+    let print = Arg::new("print_config").long("print-config").action(ArgAction::SetTrue);
+    let print =
+        print.help("Prints the settings that are in force, as a file for --config, and ends");
+    let command = Source::augment_args(Config::command()).arg(print);
+    layers::read(Task::augment_subcommands(command).subcommand_required(false), &arguments)
 }
 
 /// Starts the program anew, once, if OpenMP's settings are not there.
@@ -56,43 +88,46 @@ fn with_openmp_settings() -> std::io::Result<()> {
     Err(again.args(arguments).envs(missing).exec())
 }
 
-#[tokio::main]
-async fn run(config: Config) -> anyhow::Result<()> {
-    logs(&config.log).context("--log cannot be understood")?;
+fn run(layered: Layered) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Runtime::new()?;
+    let done = runtime.block_on(serve(layered));
+    // A checkpoint that is being loaded keeps nobody waiting.
+    runtime.shutdown_background();
+    done
+}
+
+async fn serve(mut layered: Layered) -> anyhow::Result<()> {
+    let logs = Logs::start(&layered.config)?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
-    let starting = App::start(config, app::load);
+    let mut hang_up = signal(SignalKind::hangup())?;
+    let starting = App::start(layered.config.clone(), app::load);
     let mut app = tokio::select! {
         app = starting => app?,
         _ = interrupt.recv() => return Ok(()),
         _ = terminate.recv() => return Ok(()),
     };
     println!("ready grpc={} http={} admin={}", app.grpc, app.http, app.admin);
-    let lost = tokio::select! {
-        _ = interrupt.recv() => false,
-        _ = terminate.recv() => false,
-        () = app.engine_ended() => true,
+    let lost = loop {
+        tokio::select! {
+            _ = interrupt.recv() => break false,
+            _ = terminate.recv() => break false,
+            _ = hang_up.recv() => match configuration() {
+                Ok(new) => {
+                    tokio::select! {
+                        () = reload::apply(&app, &logs, &layered, &new) => layered = new,
+                        _ = interrupt.recv() => break false,
+                        _ = terminate.recv() => break false,
+                    }
+                }
+                Err(problem) => reload::refused(problem),
+            },
+            () = app.engine_ended() => break true,
+        }
     };
     tracing::info!("shutting down");
     app.shutdown().await;
+    logs.end();
     anyhow::ensure!(!lost, "the model's thread has ended");
-    Ok(())
-}
-
-/// Logs to standard error. A panic on the model's thread is caught and reported there, with the request it hit;
-/// here it adds only where it happened.
-fn logs(filter: &str) -> anyhow::Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(filter)?;
-    let colours = std::io::stderr().is_terminal();
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours);
-    log.with_writer(std::io::stderr).init();
-    std::panic::set_hook(Box::new(|panic| {
-        let on_model = std::thread::current().name() == Some("gatsbi-engine");
-        match (panic.location(), on_model) {
-            (Some(at), true) => tracing::debug!(%at, "panic on the model's thread"),
-            (_, true) => {}
-            (_, false) => tracing::error!("{panic}"),
-        }
-    }));
     Ok(())
 }

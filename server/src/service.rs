@@ -23,6 +23,7 @@ mod spread;
 mod start;
 
 use std::{
+    ops::Deref,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -33,9 +34,14 @@ use tokio_util::sync::CancellationToken;
 
 use self::{handles::Opened, models::Catalogue};
 use crate::{
+    access::tenants::{Amount, Owner},
     checkpoints::Checkpoints,
     config::Config,
-    engine::{Engine, commands::Tenant, models::ModelEntry},
+    engine::{
+        Chunks, Engine,
+        commands::{Imagine, Tenant, Urgency},
+        models::ModelEntry,
+    },
     error::Error,
     sessions::{
         registry::{Limits, Registry},
@@ -43,9 +49,16 @@ use crate::{
     },
 };
 
-/// The use cases.
+/// The use cases, as one owner may use them: it sees what is its own, and all if it is the operator.
 #[derive(Debug)]
 pub struct Service {
+    shared: Arc<Shared>,
+    owner: Owner,
+}
+
+/// What the use cases of all owners share.
+#[derive(Debug)]
+pub struct Shared {
     engine: Engine,
     catalogue: Catalogue,
     registry: Registry,
@@ -95,7 +108,7 @@ impl Service {
             max_request_bytes: (config.max_request_mib << 20) as u32,
         };
         let kept = Limits { sessions: config.max_sessions, kept_bytes: config.max_kept_mib << 20 };
-        Self {
+        let shared = Shared {
             engine,
             catalogue: Catalogue::new(models),
             registry: Registry::new(kept),
@@ -107,7 +120,14 @@ impl Service {
             checkpoints: config.checkpoints(),
             changing: tokio::sync::Mutex::new(()),
             stop,
-        }
+        };
+        Self { shared: Arc::new(shared), owner: Owner::default() }
+    }
+
+    /// The same use cases for somebody else.
+    #[must_use]
+    pub fn of(&self, owner: Owner) -> Self {
+        Self { shared: Arc::clone(&self.shared), owner }
     }
 
     /// Cancelled when the server goes down.
@@ -132,7 +152,25 @@ impl Service {
     /// # Errors
     /// If there is none.
     pub fn session(&self, id: &str) -> Result<Arc<Session>, Error> {
-        self.registry.get(id, Instant::now())
+        self.registry.get(id, &self.owner, Instant::now())
+    }
+
+    /// Starts a rollout within what the owner may have under way. Bulk work waits for its turn.
+    async fn roll(&self, job: Imagine, output_bytes: u64) -> Result<Chunks, Error> {
+        let amount = Amount::rows(job.rows());
+        let share = match job.urgency {
+            Urgency::Live => self.owner.take(amount)?,
+            Urgency::Bulk => self.owner.take_when_free(amount).await?,
+        };
+        self.engine.imagine(job, output_bytes, share).await
+    }
+}
+
+impl Deref for Service {
+    type Target = Shared;
+
+    fn deref(&self) -> &Shared {
+        &self.shared
     }
 }
 

@@ -5,7 +5,7 @@
 
 use std::{
     sync::OnceLock,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use metrics::{Counter, Histogram, counter, gauge, histogram};
@@ -33,8 +33,10 @@ const BATCH_ROWS: &str = "gatsbi_batch_rows";
 const BATCH_FILL: &str = "gatsbi_batch_fill_ratio";
 const STEP_SECONDS: &str = "gatsbi_step_duration_seconds";
 const FAILURES: &str = "gatsbi_model_failures_total";
+const TURNED_AWAY: &str = "gatsbi_turned_away_total";
 const GIVEN_UP: &str = "gatsbi_given_up_total";
 const IMAGES_SKIPPED: &str = "gatsbi_images_skipped_total";
+const CERTIFICATE_ENDS: &str = "gatsbi_certificate_expiry_timestamp_seconds";
 const SESSIONS: &str = "gatsbi_sessions";
 const SESSION_BYTES: &str = "gatsbi_session_bytes";
 const QUEUE_SECONDS: &str = "gatsbi_queue_duration_seconds";
@@ -86,6 +88,16 @@ const METRICS: &[Metric] = &[
         name: IMAGES_SKIPPED,
         what: "Images passed over for newer ones",
         kind: MetricKind::Counter,
+    },
+    Metric {
+        name: TURNED_AWAY,
+        what: "Requests without a key that is good for them, by reason",
+        kind: MetricKind::Counter,
+    },
+    Metric {
+        name: CERTIFICATE_ENDS,
+        what: "When the certificate of the server ends, in seconds since 1970; with TLS only",
+        kind: MetricKind::Gauge,
     },
     Metric { name: SESSIONS, what: "Open sessions", kind: MetricKind::Gauge },
     Metric { name: SESSION_BYTES, what: "Memory of open sessions", kind: MetricKind::Gauge },
@@ -165,6 +177,17 @@ pub fn image_skipped() {
     counter!(IMAGES_SKIPPED).increment(1);
 }
 
+/// A request came without a key that is good for it.
+pub fn turned_away(reason: &'static str) {
+    counter!(TURNED_AWAY, "reason" => reason).increment(1);
+}
+
+/// When the certificate ends.
+pub fn certificate_ends(at: SystemTime) {
+    let since = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    gauge!(CERTIFICATE_ENDS).set(since.as_secs() as f64);
+}
+
 /// Sessions were opened or closed.
 pub fn sessions(count: usize, bytes: usize) {
     gauge!(SESSIONS).set(count as f64);
@@ -206,6 +229,7 @@ impl Request {
         if let Error::Overloaded { .. }
         | Error::TooSlow { .. }
         | Error::TooManySessions { .. }
+        | Error::QuotaExceeded { .. }
         | Error::TooMuchKept { .. } = error
         {
             counter!(REFUSALS, "reason" => reason).increment(1);
@@ -230,6 +254,18 @@ impl Drop for Request {
             self.count("CANCELLED");
         }
     }
+}
+
+/// Name, kind and meaning of every metric.
+pub fn described() -> impl ExactSizeIterator<Item = (&'static str, &'static str, &'static str)> {
+    METRICS.iter().map(|Metric { name, what, kind }| {
+        let kind = match kind {
+            MetricKind::Counter => "counter",
+            MetricKind::Gauge => "gauge",
+            MetricKind::Histogram => "histogram",
+        };
+        (*name, kind, *what)
+    })
 }
 
 /// Switches metrics on for the process, once, and gives what renders them.

@@ -144,9 +144,16 @@ impl Answer {
 
 /// Runs the command line.
 pub(crate) fn gatsbi(arguments: &[&str]) -> Answer {
-    let mut command = Command::new(program("gatsbi"));
-    let Output { status, stdout, stderr } =
-        command.env_remove("GATSBI_SERVER").args(arguments).output().unwrap();
+    run("gatsbi", arguments)
+}
+
+/// Runs one of our programs to its end.
+pub(crate) fn run(name: &str, arguments: &[&str]) -> Answer {
+    let mut command = Command::new(program(name));
+    for variable in ["GATSBI_SERVER", "GATSBI_API_KEY", "GATSBI_CA"] {
+        command.env_remove(variable);
+    }
+    let Output { status, stdout, stderr } = command.args(arguments).output().unwrap();
     let text = |bytes| String::from_utf8(bytes).unwrap();
     Answer { code: status.code(), out: text(stdout), err: text(stderr) }
 }

@@ -3,7 +3,8 @@
 //! It must build before libtorch is there and is the first thing a newcomer waits for, so it depends on
 //! none of our crates and on few others. Read on in [`setup`], which provides libtorch, [`cargo`], which runs
 //! the checks and builds, and [`demo`], which shows the whole; [`twin`] and [`mod@bench`] hold the model against a second
-//! one in PyTorch, [`mod@bundle_train`] takes training elsewhere. [`process`] looks after programs that run beside it.
+//! one in PyTorch, [`mod@bundle_train`] takes training elsewhere, [`package`] makes what is shipped. [`process`] looks
+//! after programs that run beside it.
 
 mod bench;
 mod bundle_train;
@@ -12,6 +13,7 @@ mod demo;
 mod libtorch;
 mod metrics;
 mod mujoco;
+mod package;
 mod process;
 mod setup;
 mod twin;
@@ -70,6 +72,10 @@ enum Command {
     BundleTrain(bundle_train::Arguments),
     /// Provide the pretrained networks of the perceptual metrics (110 MB to download); prints the file for gatsbi-train eval
     Metrics,
+    /// Make a tarball that runs wherever it is unpacked: programs, libraries, the bundled checkpoint, settings, licences
+    ///
+    /// It is left in target/package.
+    Package(package::Arguments),
     /// Format the sources
     Fmt,
 }
@@ -97,6 +103,7 @@ fn run(command: Command) -> Result<()> {
         Command::Twin { presets } => twin::agree(root, &presets),
         Command::Bench(arguments) => bench::bench(root, &arguments),
         Command::BundleTrain(arguments) => bundle_train::bundle(root, &arguments),
+        Command::Package(arguments) => package::package(root, &arguments),
         Command::Metrics => metrics::provide(),
         Command::Fmt => cargo::fmt(root),
     }

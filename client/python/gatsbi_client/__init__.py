@@ -9,8 +9,8 @@ from gatsbi_client._core import Retries
 from gatsbi_client._proto.gatsbi.v1.planning_service_pb2 import Cem, Icem, Mppi, RandomShooting
 from gatsbi_client._sync import Client, Handles, Session, Stream
 from gatsbi_client.errors import (
-    Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotFound, NotImplementedByServer,
-    Overloaded, ServerFailure, StepGap, Unavailable,
+    Conflict, DeadlineExceeded, FieldProblem, GatsbiError, InvalidRequest, NotAllowed, NotFound,
+    NotImplementedByServer, Overloaded, ServerFailure, StepGap, Unavailable,
 )
 from gatsbi_client.types import (
     Belief, Chunk, Goal, Model, Plan, Prediction, PredictionPart, Rollout, Scores, SessionInfo,
@@ -19,6 +19,7 @@ from gatsbi_client.types import (
 __all__ = [
     "AsyncClient", "AsyncHandles", "AsyncSession", "AsyncStream", "Belief", "Cem", "Chunk", "Client", "Conflict",
     "DeadlineExceeded", "FieldProblem", "GatsbiError", "Goal", "Handles", "Icem", "InvalidRequest", "Model", "Mppi",
-    "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart", "RandomShooting",
-    "Retries", "Rollout", "Scores", "ServerFailure", "Session", "SessionInfo", "StepGap", "Stream", "Unavailable", "costs",
+    "NotAllowed", "NotFound", "NotImplementedByServer", "Overloaded", "Plan", "Prediction", "PredictionPart",
+    "RandomShooting", "Retries", "Rollout", "Scores", "ServerFailure", "Session", "SessionInfo", "StepGap", "Stream",
+    "Unavailable", "costs",
 ]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import queue
 import time
+from os import PathLike
 from types import TracebackType
 from typing import Iterable, Iterator, Callable, Iterable, Mapping, Sequence, TypeVar, cast
 
 import grpc
 import numpy.typing as npt
 
+from gatsbi_client import _access as access
 from gatsbi_client import _core as core
 from gatsbi_client import errors
 from gatsbi_client import types as t
@@ -24,9 +26,22 @@ T = TypeVar("T")
 class Client:
     """A connection to a server, such as `127.0.0.1:50051`."""
 
-    def __init__(self, address: str, *, timeout: float = 30.0, retries: Retries = Retries()) -> None:
-        """`timeout` is in seconds for a whole call with all its tries."""
-        self._channel = grpc.insecure_channel(address, options=core.CHANNEL_OPTIONS)
+    def __init__(
+        self, address: str, *, timeout: float = 30.0, retries: Retries = Retries(),
+        api_key: str | None = None, ca: str | PathLike[str] | None = None,
+        certificate: tuple[str | PathLike[str], str | PathLike[str]] | None = None,
+    ) -> None:
+        """`timeout` is in seconds for a whole call with all its tries.
+
+        `api_key` is `GATSBI_API_KEY` of the environment if absent. With `ca`, a file of authorities (PEM), TLS is
+        spoken; `certificate` are the files of an own certificate and its key, where the server asks for one.
+        """
+        credentials = access.credentials(ca, certificate)
+        if credentials is None:
+            channel = grpc.insecure_channel(address, options=core.CHANNEL_OPTIONS)
+        else:
+            channel = grpc.secure_channel(address, credentials, options=core.CHANNEL_OPTIONS)
+        self._channel = access.Keyed(channel, access.key(api_key))
         self._timeout = timeout
         self._retries = retries
 

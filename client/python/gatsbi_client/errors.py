@@ -52,6 +52,10 @@ class InvalidRequest(GatsbiError):
     """The request is wrong; `fields` says where."""
 
 
+class NotAllowed(GatsbiError):
+    """The key is missing, unknown, expired, or not good for this."""
+
+
 class NotFound(GatsbiError):
     """No such session, model or handles."""
 
@@ -93,6 +97,8 @@ class ServerFailure(GatsbiError):
 _CLASSES: dict[grpc.StatusCode, type[GatsbiError]] = {
     grpc.StatusCode.INVALID_ARGUMENT: InvalidRequest,
     grpc.StatusCode.OUT_OF_RANGE: InvalidRequest,
+    grpc.StatusCode.UNAUTHENTICATED: NotAllowed,
+    grpc.StatusCode.PERMISSION_DENIED: NotAllowed,
     grpc.StatusCode.NOT_FOUND: NotFound,
     grpc.StatusCode.FAILED_PRECONDITION: Conflict,
     grpc.StatusCode.ALREADY_EXISTS: Conflict,

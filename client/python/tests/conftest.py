@@ -3,6 +3,7 @@ import socket
 import subprocess
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +21,15 @@ def free_port():
         return s.getsockname()[1]
 
 
-@pytest.fixture(scope="session")
-def address(tmp_path_factory):
+@contextmanager
+def serving(log, *flags):
+    """The gRPC address of a server with these flags."""
     program = os.environ.get("GATSBI_SERVER", str(ROOT / "target/debug/gatsbi-server"))
-    log = tmp_path_factory.mktemp("server") / "log"
     grpc, http, admin = (f"127.0.0.1:{free_port()}" for _ in range(3))
     with log.open("w") as out:
         server = subprocess.Popen(
             [program, "--checkpoint", str(ROOT / "models/checkpoints/push1-tiny.safetensors"), "--threads", "1",
-             "--grpc-listen", grpc, "--http-listen", http, "--admin-listen", admin], stdout=out, stderr=out)
+             "--grpc-listen", grpc, "--http-listen", http, "--admin-listen", admin, *flags], stdout=out, stderr=out)
     try:
         with gc.Client(grpc) as client:
             for _ in range(100):
@@ -36,12 +37,20 @@ def address(tmp_path_factory):
                 try:
                     client.models()
                     break
+                except gc.NotAllowed:
+                    break
                 except gc.Unavailable:
                     time.sleep(0.1)
         yield grpc
     finally:
         server.terminate()
         server.wait(20)
+
+
+@pytest.fixture(scope="session")
+def address(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("server") / "log") as address:
+        yield address
 
 
 @pytest.fixture

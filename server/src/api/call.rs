@@ -13,7 +13,7 @@ use axum::{
 use crate::service::Call;
 
 /// Names the tenant that shares the server with others, on both APIs.
-const TENANT: &str = "gatsbi-tenant";
+pub(crate) const TENANT: &str = "gatsbi-tenant";
 
 /// What headers (on gRPC: metadata) say.
 pub(super) fn of(headers: &HeaderMap) -> Call {

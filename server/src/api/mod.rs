@@ -1,7 +1,7 @@
 //! The two skins over [`crate::service`]: gRPC and REST. Neither decides anything.
 
 pub mod admin;
-mod call;
+pub(crate) mod call;
 mod counted;
 mod form;
 pub mod grpc;

@@ -59,7 +59,16 @@ fn document(files: &FileDescriptorSet) -> Json {
             "license": { "name": "Apache-2.0 OR MIT", "identifier": "Apache-2.0 OR MIT" },
         },
         "paths": paths,
-        "components": { "schemas": components },
+        // Where the server was started with keys; without them none is needed.
+        "security": [{}, { "key": [] }],
+        "components": {
+            "schemas": components,
+            "securitySchemes": { "key": {
+                "type": "http",
+                "scheme": "bearer",
+                "description": "A key that the operator made: Authorization: Bearer KEY.",
+            } },
+        },
     })
 }
 

@@ -48,6 +48,13 @@ pub fn entry(error: &Error) -> Entry {
         Error::TooLarge { .. } => {
             ("BODY_TOO_LARGE", Code::OutOfRange, StatusCode::PAYLOAD_TOO_LARGE)
         }
+        Error::NoKey => ("NO_KEY", Code::Unauthenticated, StatusCode::UNAUTHORIZED),
+        Error::WrongKey => ("WRONG_KEY", Code::Unauthenticated, StatusCode::UNAUTHORIZED),
+        Error::ExpiredKey => ("EXPIRED_KEY", Code::Unauthenticated, StatusCode::UNAUTHORIZED),
+        Error::RoleTooLow { .. } => ("ROLE_TOO_LOW", Code::PermissionDenied, StatusCode::FORBIDDEN),
+        Error::QuotaExceeded { .. } => {
+            ("QUOTA_EXCEEDED", Code::ResourceExhausted, StatusCode::TOO_MANY_REQUESTS)
+        }
         Error::UnknownSession { .. } => ("UNKNOWN_SESSION", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownModel { .. } => ("UNKNOWN_MODEL", Code::NotFound, StatusCode::NOT_FOUND),
         Error::UnknownHandles { .. } => ("UNKNOWN_HANDLES", Code::NotFound, StatusCode::NOT_FOUND),
@@ -228,6 +235,12 @@ mod tests {
             Error::Malformed { message: "ObserveRequest".into(), reason: "EOF".into() },
             Error::MediaType { found: "text/html".into(), expected: "application/json" },
             Error::TooLarge { limit_bytes: 1024 },
+            Error::NoKey,
+            Error::WrongKey,
+            Error::ExpiredKey,
+            Error::RoleTooLow { role: "read", needs: "predict" },
+            Error::QuotaExceeded { what: "open sessions", limit: 3 },
+            Error::QuotaExceeded { what: "rows of rollouts under way", limit: 64 },
             Error::UnknownSession { id: "7".into() },
             Error::UnknownModel { name: "x".into(), served: vec!["tiny".into()] },
             Error::UnknownHandles { id: "7".into() },

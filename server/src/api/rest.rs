@@ -26,6 +26,21 @@ use crate::{dashboard, error::Error, service::Service};
 
 type App = State<Arc<Service>>;
 
+/// What holds nothing that is anybody's: the files of the live page, the document of the API at /openapi.json, and a
+/// page over it that needs nothing from elsewhere.
+pub fn open(service: &Arc<Service>) -> Router {
+    Router::new()
+        .merge(dashboard::routes())
+        .merge(documentation())
+        .fallback(unknown_path)
+        .method_not_allowed_fallback(unknown_method)
+        .with_state(Arc::clone(service))
+}
+
+fn documentation() -> SwaggerUi {
+    SwaggerUi::new("/docs").external_url_unchecked("/openapi.json", DOCUMENT.clone())
+}
+
 /// All paths.
 pub fn router(service: Arc<Service>) -> Router {
     let limit = service.limits().max_request_bytes as usize;
@@ -48,8 +63,7 @@ pub fn router(service: Arc<Service>) -> Router {
         .merge(pictures::routes())
         .merge(live::routes())
         .merge(dashboard::routes())
-        // The document itself at /openapi.json, and a page over it that needs nothing from elsewhere.
-        .merge(SwaggerUi::new("/docs").external_url_unchecked("/openapi.json", DOCUMENT.clone()))
+        .merge(documentation())
         .fallback(unknown_path)
         .method_not_allowed_fallback(unknown_method)
         .layer(DefaultBodyLimit::max(limit))

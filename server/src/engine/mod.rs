@@ -41,7 +41,7 @@ use self::{
     models::{LoadedModel, ModelEntry, ModelId, Newcomer},
     scheduler::Sizes,
 };
-use crate::error::Error;
+use crate::{access::tenants::Share, error::Error};
 
 pub use self::{
     door::DoorSizes,
@@ -73,14 +73,15 @@ pub struct Engine {
 /// The chunks of a rollout as they come; dropped, the rollout ends.
 #[derive(Debug)]
 pub struct Chunks {
-    chunks: mpsc::Receiver<Result<Chunk, Failure>>,
+    finished: mpsc::Receiver<Result<Chunk, Failure>>,
     _outputs: OwnedSemaphorePermit,
+    _share: Share,
 }
 
 impl Chunks {
     /// The next chunk; after the last chunk or a failure there is nothing to wait for.
     pub async fn next(&mut self) -> Option<Result<Chunk, Error>> {
-        Some(self.chunks.recv().await?.map_err(Error::from))
+        Some(self.finished.recv().await?.map_err(Error::from))
     }
 }
 
@@ -163,11 +164,17 @@ impl Engine {
         Ok(answer.await.map_err(gone)??)
     }
 
-    /// Starts a rollout that may give up to `output_bytes` of outputs.
+    /// Starts a rollout that may give up to `output_bytes` of outputs; its tenant's share is held as long as it is
+    /// under way.
     ///
     /// # Errors
     /// If too much is on its way already, or it cannot be done by its deadline.
-    pub async fn imagine(&self, job: Imagine, output_bytes: u64) -> Result<Chunks, Error> {
+    pub async fn imagine(
+        &self,
+        job: Imagine,
+        output_bytes: u64,
+        share: Share,
+    ) -> Result<Chunks, Error> {
         let (rows, steps) = (job.rows(), job.last_depth());
         let load = Load { rows, steps, output_bytes, deadline: job.deadline };
         let costs = &job.model.costs;
@@ -180,7 +187,7 @@ impl Engine {
         let (reply, chunks) = mpsc::channel(rows as usize * steps as usize + 1);
         let command = Command::Imagine(order(job, reply, ticket));
         self.commands.send(command).await.map_err(gone)?;
-        Ok(Chunks { chunks, _outputs: outputs })
+        Ok(Chunks { finished: chunks, _outputs: outputs, _share: share })
     }
 }
 

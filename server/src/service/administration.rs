@@ -8,6 +8,7 @@ use gatsbi_proto::v1::{self, SwapPolicy};
 
 use super::{Service, aside};
 use crate::{
+    checkpoints::Checkpoints,
     engine::models::ModelEntry,
     error::{Error, told},
     sessions::session::{Position, Session},
@@ -109,6 +110,39 @@ impl Service {
         })
     }
 
+    /// Serves a checkpoint file if it is another than the one that is served under its name; sessions that are open
+    /// keep theirs. Returns whether it is.
+    ///
+    /// # Errors
+    /// If it cannot be served. What is served stays as it is.
+    pub async fn refresh_model(
+        &self,
+        checkpoints: Checkpoints,
+        path: PathBuf,
+        name: Option<String>,
+    ) -> Result<bool, Error> {
+        let _change = self.changing.lock().await;
+        let (engine, served, shown) = (self.engine.clone(), self.catalogue.all(), path.clone());
+        let fresh = aside(move || {
+            let model = checkpoints.load(&path, name.as_deref()).map_err(|error| told(&error))?;
+            let hash = model.world.spec().hash.clone();
+            let same = |it: &Arc<ModelEntry>| it.spec.name == model.name && it.spec.hash == hash;
+            if served.iter().any(same) {
+                return Ok(None);
+            }
+            engine.serve(model).map(Some).map_err(|error| told(&error))
+        });
+        let fresh = fresh.await?.map_err(|reason: String| Error::BadCheckpoint {
+            path: shown.display().to_string(),
+            reason,
+        })?;
+        let changed = fresh.is_some();
+        if let Some(model) = fresh {
+            self.catalogue.put(model);
+        }
+        Ok(changed)
+    }
+
     fn is_free(&self, name: &str) -> Result<(), Error> {
         if self.catalogue.all().iter().any(|model| model.spec.name == name) {
             return Err(Error::ModelExists { name: name.to_owned() });
@@ -130,7 +164,7 @@ impl Service {
     /// Sessions of all models that go or went by a name.
     fn sessions_of(&self, name: &str) -> Vec<Arc<Session>> {
         let of = |session: &Session| session.position().model.spec.name == name;
-        self.registry.list(None, usize::MAX, Instant::now(), of)
+        self.registry.list(&self.owner, None, usize::MAX, Instant::now(), of)
     }
 
     /// Lets a model see what a session saw, and the session go over to it; false if that cannot be.

@@ -8,14 +8,17 @@ use std::{
 
 use gatsbi_proto::v1::{self, DataType, image::Content};
 use parking_lot::{Mutex, RwLock};
-use tokio::sync::OwnedSemaphorePermit;
 
 use super::{Service, programs};
 use crate::{
+    access::tenants::Owner,
     engine::models::ModelEntry,
     error::Error,
     planning::cost::Subject,
-    sessions::session::{bits, shortened},
+    sessions::{
+        registry::Room,
+        session::{bits, shortened},
+    },
 };
 
 /// Masks by the part of a scene that they are of, each `[H, W]` in [0, 1] with whose it is.
@@ -38,9 +41,10 @@ pub(super) struct Goal {
     pub(super) image: Option<Arc<[f32]>>,
     /// Its masks.
     pub(super) masks: Masks,
+    owner: Owner,
     ttl: Duration,
     used: Mutex<Instant>,
-    _room: OwnedSemaphorePermit,
+    _room: Room,
 }
 
 impl Goal {
@@ -86,7 +90,7 @@ impl Service {
         let pixels = (model.spec.image_size * model.spec.image_size) as u64;
         let pictures = masks.values().map(|masks| masks.len() as u64).sum::<u64>()
             + image.as_ref().map_or(0, |_| 3);
-        let room = self.registry.reserve(pictures * pixels * 4)?;
+        let room = self.registry.reserve(pictures * pixels * 4, &self.owner)?;
         let number = rand::random::<u128>();
         let id = format!("{number:032x}");
         let goal = v1::Goal {
@@ -99,7 +103,8 @@ impl Service {
         };
         let used = Mutex::new(Instant::now());
         let model_hash = model.spec.hash.clone();
-        let kept = Goal { id, model_hash, image, masks, ttl, used, _room: room };
+        let owner = self.owner.clone();
+        let kept = Goal { id, model_hash, image, masks, owner, ttl, used, _room: room };
         self.goals.goals.write().insert(number, Arc::new(kept));
         Ok(v1::PutGoalResponse { goal: Some(goal) })
     }
@@ -121,7 +126,7 @@ impl Service {
     pub(super) fn goal(&self, id: &str) -> Result<Arc<Goal>, Error> {
         let now = Instant::now();
         let goal = bits(id).and_then(|bits| self.goals.goals.read().get(&bits).cloned());
-        let goal = goal.filter(|goal| goal.expires() > now);
+        let goal = goal.filter(|goal| goal.expires() > now && self.owner.sees(&goal.owner));
         let goal = goal.ok_or_else(|| Error::UnknownGoal { id: shortened(id) })?;
         *goal.used.lock() = now;
         Ok(goal)

@@ -16,7 +16,7 @@ use gatsbi_proto::v1;
 use parking_lot::{Mutex, RwLock};
 use prost::Message as _;
 use sha2::{Digest as _, Sha256};
-use tokio::{sync::OwnedSemaphorePermit, time::timeout_at};
+use tokio::time::timeout_at;
 
 use super::{
     Call, Service, answer, aside,
@@ -24,12 +24,16 @@ use super::{
     imagine::row_bytes,
 };
 use crate::{
+    access::tenants::Owner,
     engine::{
         commands::{Chunk, Depths, Imagine, RowStart, Spent, Tenant, Urgency, Value},
         models::ModelEntry,
     },
     error::Error,
-    sessions::session::{Position, bits, shortened},
+    sessions::{
+        registry::Room,
+        session::{Position, bits, shortened},
+    },
     tensor,
 };
 
@@ -45,12 +49,13 @@ pub(super) struct Opened {
 #[derive(Debug)]
 struct Handles {
     id: u128,
+    owner: Owner,
     model: Arc<ModelEntry>,
     ttl: Duration,
     /// Held by the step that is being taken.
     turn: tokio::sync::Mutex<()>,
     current: Mutex<Current>,
-    _room: OwnedSemaphorePermit,
+    _room: Room,
 }
 
 #[derive(Debug)]
@@ -87,9 +92,10 @@ impl Row {
 }
 
 impl Opened {
-    fn get(&self, id: &str) -> Result<Arc<Handles>, Error> {
+    fn get(&self, id: &str, viewer: &Owner) -> Result<Arc<Handles>, Error> {
         let found = bits(id).and_then(|key| self.sets.read().get(&key).cloned());
-        let found = found.filter(|handles| handles.expires() > Instant::now());
+        let found = found
+            .filter(|handles| handles.expires() > Instant::now() && viewer.sees(&handles.owner));
         let handles = found.ok_or_else(|| Error::UnknownHandles { id: shortened(id) })?;
         handles.current.lock().used = Instant::now();
         Ok(handles)
@@ -138,7 +144,7 @@ impl Service {
             let expected = format!("all on one model, as starts[0] on {}", model.spec.hash);
             return Err(Error::invalid(format!("starts[{at}]"), found, expected));
         }
-        let room = self.registry.reserve(rows * model.row_bytes as u64)?;
+        let room = self.registry.reserve(rows * model.row_bytes as u64, &self.owner)?;
         let start = |row: u32| {
             let (at, sample) = (row / draws.samples, row % draws.samples);
             Row::new(draws.start(&positions[at as usize], row, (at, sample)))
@@ -152,6 +158,7 @@ impl Service {
         };
         let handles = Handles {
             id: rand::random(),
+            owner: self.owner.clone(),
             ttl,
             turn: tokio::sync::Mutex::new(()),
             current: Mutex::new(current),
@@ -179,7 +186,7 @@ impl Service {
         request: v1::StepHandlesRequest,
         call: Call,
     ) -> Result<v1::StepHandlesResponse, Error> {
-        let handles = self.handles.get(&request.handles_id)?;
+        let handles = self.handles.get(&request.handles_id, &self.owner)?;
         let deadline = fields::deadline(request.timeout_millis, call.deadline)?;
         let tenant = call.tenant.unwrap_or(Tenant(handles.id));
         let stepping = self.step(&handles, request, tenant, deadline);
@@ -200,7 +207,7 @@ impl Service {
         &self,
         request: &v1::CloseHandlesRequest,
     ) -> Result<v1::CloseHandlesResponse, Error> {
-        let handles = self.handles.get(&request.handles_id)?;
+        let handles = self.handles.get(&request.handles_id, &self.owner)?;
         self.handles.sets.write().remove(&handles.id);
         tracing::info!(handles = request.handles_id, "handles closed");
         Ok(v1::CloseHandlesResponse {})
@@ -253,7 +260,7 @@ impl Service {
             deadline,
             urgency: Urgency::Live,
         };
-        let mut chunks = self.engine.imagine(job, bytes).await?;
+        let mut chunks = self.roll(job, bytes).await?;
         let mut gathered = Gathered::new(stepping.len());
         loop {
             let chunk = chunks.next().await.unwrap_or(Err(Error::ShuttingDown))?;

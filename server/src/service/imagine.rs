@@ -158,7 +158,7 @@ impl Service {
             deadline,
             urgency,
         };
-        let chunks = self.engine.imagine(job, output_bytes).await?;
+        let chunks = self.roll(job, output_bytes).await?;
         Ok(Rollout::new(chunks, common, selection, draws.samples, deadline))
     }
 

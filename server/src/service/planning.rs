@@ -268,7 +268,7 @@ impl Service {
                 deadline: question.deadline,
                 urgency: Urgency::Live,
             };
-            let mut chunks = self.engine.imagine(job, bytes).await?;
+            let mut chunks = self.roll(job, bytes).await?;
             loop {
                 let chunk = chunks.next().await.unwrap_or(Err(Error::ShuttingDown))?;
                 telemetry::waited(telemetry::Kind::Imagine, chunk.spent.queue);

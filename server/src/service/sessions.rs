@@ -40,6 +40,7 @@ impl Service {
             model,
         };
         let terms = Terms {
+            owner: self.owner.clone(),
             label: request.label,
             ttl: self.ttl(request.ttl)?,
             keep_steps: request.keep_steps,
@@ -83,7 +84,8 @@ impl Service {
         let matches =
             |session: &Session| request.label.is_empty() || session.terms.label == request.label;
         // One more than asked for tells whether there is another page.
-        let mut page = self.registry.list(after, size as usize + 1, Instant::now(), matches);
+        let mut page =
+            self.registry.list(&self.owner, after, size as usize + 1, Instant::now(), matches);
         let more = page.len() > size as usize;
         page.truncate(size as usize);
         let last = page.last().filter(|_| more).map(|session| session.id.to_string());
@@ -101,7 +103,7 @@ impl Service {
         &self,
         request: &v1::DeleteSessionRequest,
     ) -> Result<v1::DeleteSessionResponse, Error> {
-        self.registry.delete(&request.session_id, Instant::now())?;
+        self.registry.delete(&request.session_id, &self.owner, Instant::now())?;
         tracing::info!(session = request.session_id, "session closed");
         Ok(v1::DeleteSessionResponse {})
     }

@@ -95,7 +95,7 @@ impl Service {
     /// What the server does now, with up to `most` sessions.
     pub fn overview(&self, most: usize) -> Overview {
         let now = Instant::now();
-        let mut sessions = self.registry.list(None, usize::MAX, now, |_| true);
+        let mut sessions = self.registry.list(&self.owner, None, usize::MAX, now, |_| true);
         let open = sessions.len();
         sessions.sort_by_cached_key(|session| std::cmp::Reverse(session.used()));
         sessions.truncate(most);

@@ -47,6 +47,7 @@ impl Service {
                 snapshot.position(self.model_of(&snapshot, "snapshot")?, "snapshot")?;
             position.draws.seed = request.seed.unwrap_or(position.draws.seed);
             let terms = Terms {
+                owner: self.owner.clone(),
                 label: request.label,
                 ttl: self.ttl(request.ttl)?,
                 keep_steps: request.keep_steps,

@@ -11,7 +11,10 @@ use parking_lot::RwLock;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::session::{History, Position, Session, SessionId, Terms, shortened};
-use crate::error::Error;
+use crate::{
+    access::tenants::{Amount, Owner, Share},
+    error::Error,
+};
 
 /// How much sessions may keep.
 #[derive(Clone, Copy, Debug)]
@@ -20,6 +23,13 @@ pub struct Limits {
     pub sessions: usize,
     /// Bytes of earlier steps and frames, of all sessions together.
     pub kept_bytes: u64,
+}
+
+/// Room for something that is kept, of the server's and of its owner's.
+#[derive(Debug)]
+pub struct Room {
+    _server: OwnedSemaphorePermit,
+    _owner: Share,
 }
 
 /// The open sessions.
@@ -61,7 +71,9 @@ impl Registry {
         }
         let mut opened = Vec::with_capacity(count);
         for beginning in beginnings {
-            let kib = kept_bytes(terms, &beginning.0).div_ceil(1024);
+            let bytes = kept_bytes(terms, &beginning.0);
+            let share = terms.owner.take(Amount::session(bytes))?;
+            let kib = bytes.div_ceil(1024);
             let room = u32::try_from(kib)
                 .ok()
                 .and_then(|kib| Arc::clone(&self.room).try_acquire_many_owned(kib).ok());
@@ -69,6 +81,7 @@ impl Registry {
                 let limit_bytes = self.limits.kept_bytes;
                 return Err(Error::TooMuchKept { limit_bytes, retry_after: retry_after() });
             };
+            let room = Room { _server: room, _owner: share };
             let id = SessionId(rand::random());
             opened.push(Arc::new(Session::new(id, terms.clone(), beginning, room, now)));
         }
@@ -76,36 +89,40 @@ impl Registry {
         Ok(opened)
     }
 
-    /// Room for so much else that is kept for a client.
+    /// Room for so much else that is kept for an owner.
     ///
     /// # Errors
     /// If there is none.
-    pub fn reserve(&self, bytes: u64) -> Result<OwnedSemaphorePermit, Error> {
+    pub fn reserve(&self, bytes: u64, owner: &Owner) -> Result<Room, Error> {
+        let share = owner.take(Amount::kept(bytes))?;
         let kib = u32::try_from(bytes.div_ceil(1024)).unwrap_or(u32::MAX);
-        Arc::clone(&self.room).try_acquire_many_owned(kib).map_err(|_full| {
+        let room = Arc::clone(&self.room).try_acquire_many_owned(kib).map_err(|_full| {
             let now = Instant::now();
             let next = self.sessions.read().values().map(|session| session.expires()).min();
             let retry_after = next.map_or(Duration::from_secs(1), |next| next.duration_since(now));
             Error::TooMuchKept { limit_bytes: self.limits.kept_bytes, retry_after }
-        })
+        })?;
+        Ok(Room { _server: room, _owner: share })
     }
 
-    /// A session, which counts as used at `now`.
+    /// A session that `viewer` sees, which counts as used at `now`.
     ///
     /// # Errors
     /// If there is none, or it has expired.
-    pub fn get(&self, id: &str, now: Instant) -> Result<Arc<Session>, Error> {
+    pub fn get(&self, id: &str, viewer: &Owner, now: Instant) -> Result<Arc<Session>, Error> {
         let key: SessionId = id.parse()?;
         let session = self.sessions.read().get(&key).cloned();
-        let session = session.filter(|session| session.expires() > now);
+        let session =
+            session.filter(|session| session.expires() > now && viewer.sees(&session.terms.owner));
         let session = session.ok_or_else(|| Error::UnknownSession { id: shortened(id) })?;
         session.use_at(now);
         Ok(session)
     }
 
-    /// Up to `count` sessions after `after`, by id, that `matches` holds for; using none of them.
+    /// Up to `count` sessions after `after`, by id, that `viewer` sees and `matches` holds for; using none of them.
     pub fn list(
         &self,
+        viewer: &Owner,
         after: Option<SessionId>,
         count: usize,
         now: Instant,
@@ -114,7 +131,8 @@ impl Registry {
         let start = after.map_or(Bound::Unbounded, Bound::Excluded);
         let sessions = self.sessions.read();
         let open = sessions.range((start, Bound::Unbounded)).map(|(_, session)| session);
-        open.filter(|session| session.expires() > now && matches(session))
+        let seen = |session: &Session| viewer.sees(&session.terms.owner) && matches(session);
+        open.filter(|session| session.expires() > now && seen(session))
             .take(count)
             .cloned()
             .collect()
@@ -124,8 +142,8 @@ impl Registry {
     ///
     /// # Errors
     /// If there is none.
-    pub fn delete(&self, id: &str, now: Instant) -> Result<(), Error> {
-        let session = self.get(id, now)?;
+    pub fn delete(&self, id: &str, viewer: &Owner, now: Instant) -> Result<(), Error> {
+        let session = self.get(id, viewer, now)?;
         self.close(session.id);
         Ok(())
     }
@@ -140,6 +158,15 @@ impl Registry {
         let mut sessions = self.sessions.write();
         sessions.retain(|_, session| session.expires() > now);
         (sessions.len(), sessions.values().map(|session| session.bytes()).sum())
+    }
+}
+
+#[cfg(test)]
+impl Room {
+    /// Room that nobody else needs.
+    pub(super) fn for_test() -> Self {
+        let room = Arc::new(Semaphore::new(1)).try_acquire_owned().expect("it is free");
+        Self { _server: room, _owner: Share::default() }
     }
 }
 
@@ -178,13 +205,13 @@ mod tests {
         let after = |seconds| start + Duration::from_secs(seconds);
         let used = opened(&registry, "used", 10, start).unwrap().id.to_string();
         let unused = opened(&registry, "unused", 10, start).unwrap().id.to_string();
-        registry.get(&used, after(8)).unwrap();
-        assert!(registry.get(&used, after(15)).is_ok());
+        registry.get(&used, &Owner::default(), after(8)).unwrap();
+        assert!(registry.get(&used, &Owner::default(), after(15)).is_ok());
         assert_eq!(
-            registry.get(&unused, after(15)).unwrap_err(),
+            registry.get(&unused, &Owner::default(), after(15)).unwrap_err(),
             Error::UnknownSession { id: unused.clone() }
         );
-        assert_eq!(registry.list(None, 10, after(15), |_| true).len(), 1);
+        assert_eq!(registry.list(&Owner::default(), None, 10, after(15), |_| true).len(), 1);
         assert_eq!(registry.sweep(after(15)), (1, 32));
         assert_eq!(registry.sweep(after(26)), (0, 0));
     }
@@ -221,7 +248,7 @@ mod tests {
         assert!(matches!(refused, Error::TooMuchKept { limit_bytes: 4096, .. }), "{refused}");
         let first = registry.open(&keeping, beginnings(1), now).unwrap().remove(0);
         assert!(registry.open(&keeping, beginnings(1), now).is_err());
-        registry.delete(&first.id.to_string(), now).unwrap();
+        registry.delete(&first.id.to_string(), &Owner::default(), now).unwrap();
         drop(first);
         registry.open(&keeping, beginnings(1), now).unwrap();
     }
@@ -233,8 +260,8 @@ mod tests {
             opened(&registry, label, 10, now).unwrap();
         }
         let only_a = |session: &Session| session.terms.label == "a";
-        let first = registry.list(None, 2, now, only_a);
-        let second = registry.list(Some(first[1].id), 2, now, only_a);
+        let first = registry.list(&Owner::default(), None, 2, now, only_a);
+        let second = registry.list(&Owner::default(), Some(first[1].id), 2, now, only_a);
         assert_eq!((first.len(), second.len()), (2, 1));
         assert!(first[0].id < first[1].id && first[1].id < second[0].id);
     }

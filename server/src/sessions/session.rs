@@ -15,10 +15,12 @@ use gatsbi_models::{noise::RowNoise, state::StateRow};
 use gatsbi_proto::v1;
 use parking_lot::Mutex;
 use prost::Message as _;
-use tokio::sync::OwnedSemaphorePermit;
 
-use super::live::{Last, Live};
-use crate::{engine::models::ModelEntry, error::Error};
+use super::{
+    live::{Last, Live},
+    registry::Room,
+};
+use crate::{access::tenants::Owner, engine::models::ModelEntry, error::Error};
 
 /// 128 random bits, written as 32 hexadecimal digits.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
@@ -66,6 +68,8 @@ pub fn shortened(text: &str) -> String {
 /// What stays as it is while a session is open.
 #[derive(Clone, Debug)]
 pub struct Terms {
+    /// Whose it is.
+    pub owner: Owner,
     /// The client's name for it.
     pub label: String,
     /// How long it may lie unused.
@@ -183,7 +187,7 @@ pub struct Session {
     pub live: Live,
     current: Mutex<Current>,
     /// Room for what it keeps.
-    _room: OwnedSemaphorePermit,
+    _room: Room,
 }
 
 #[derive(Debug)]
@@ -200,7 +204,7 @@ impl Session {
         id: SessionId,
         terms: Terms,
         (position, history): (Position, History),
-        room: OwnedSemaphorePermit,
+        room: Room,
         now: Instant,
     ) -> Self {
         let current = Current { position, answer: None, history, planned: None, used: now };
@@ -375,6 +379,7 @@ pub(super) mod tests {
     /// A session's terms in tests.
     pub(in crate::sessions) fn terms(label: &str, ttl: u64, keep: (u32, u32)) -> Terms {
         Terms {
+            owner: Owner::default(),
             label: label.to_owned(),
             ttl: Duration::from_secs(ttl),
             keep_steps: keep.0,
@@ -396,7 +401,7 @@ pub(super) mod tests {
     }
 
     fn session(keep: (u32, u32)) -> Session {
-        let room = Arc::new(tokio::sync::Semaphore::new(1)).try_acquire_owned().unwrap();
+        let room = Room::for_test();
         let beginning = (at(0), History::default());
         Session::new(SessionId(1), terms("", 10, keep), beginning, room, Instant::now())
     }
@@ -454,7 +459,7 @@ pub(super) mod tests {
         absorb(&session, 4);
         let (position, history) = session.past();
         let other = Draws { seed: 9, ..position.draws };
-        let room = Arc::new(tokio::sync::Semaphore::new(1)).try_acquire_owned().unwrap();
+        let room = Room::for_test();
         let beginning = (position, history.drawing(other));
         let fork =
             Session::new(SessionId(2), terms("", 9, (3, 0)), beginning, room, Instant::now());

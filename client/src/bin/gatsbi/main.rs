@@ -15,10 +15,10 @@ mod print;
 mod recording;
 mod sessions;
 
-use std::{process::ExitCode, time::Duration};
+use std::{path::PathBuf, process::ExitCode, time::Duration};
 
 use clap::{Args, Parser, Subcommand};
-use gatsbi_client::{Client, Options, Session};
+use gatsbi_client::{ApiKey, Client, Options, Session, Tls};
 
 const EXIT_CODES: &str = "\
 Exit codes:
@@ -46,10 +46,22 @@ struct Shared {
         long,
         value_name = "URL",
         env = "GATSBI_SERVER",
-        default_value = "http://127.0.0.1:50051",
+        default_value = "127.0.0.1:50051",
         global = true
     )]
     server: String,
+    /// Key that the server asks for; better in the environment, where others do not see it
+    #[arg(long, value_name = "KEY", env = "GATSBI_API_KEY", hide_env_values = true, global = true)]
+    api_key: Option<ApiKey>,
+    /// Authorities of the server's certificate (PEM); with them TLS is spoken
+    #[arg(long, value_name = "PATH", env = "GATSBI_CA", global = true)]
+    ca: Option<PathBuf>,
+    /// Own certificate (PEM), where the server asks for one
+    #[arg(long, value_name = "PATH", requires_all = ["key", "ca"], global = true)]
+    certificate: Option<PathBuf>,
+    /// Private key of the own certificate (PEM)
+    #[arg(long, value_name = "PATH", requires = "certificate", global = true)]
+    key: Option<PathBuf>,
     /// Print JSON; errors, too, on standard error
     #[arg(long, global = true)]
     json: bool,
@@ -102,13 +114,23 @@ async fn run(cli: Cli) -> anyhow::Result<()> {
 }
 
 impl Shared {
-    async fn client(&self) -> gatsbi_client::Result<Client> {
-        let options = Options { timeout: self.timeout, ..Options::default() };
-        Client::connect_with(&self.server, options).await
+    async fn client(&self) -> anyhow::Result<Client> {
+        let read = |path: &PathBuf| fs_err::read(path);
+        let identity = match (&self.certificate, &self.key) {
+            (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
+            _ => None,
+        };
+        let tls = match &self.ca {
+            Some(ca) => Some(Tls { ca: read(ca)?, identity, server_name: None }),
+            None => None,
+        };
+        let api_key = self.api_key.clone();
+        let options = Options { timeout: self.timeout, api_key, tls, ..Options::default() };
+        Ok(Client::connect_with(&self.server, options).await?)
     }
 
-    async fn session(&self, id: &str) -> gatsbi_client::Result<Session> {
-        self.client().await?.session(id).await
+    async fn session(&self, id: &str) -> anyhow::Result<Session> {
+        Ok(self.client().await?.session(id).await?)
     }
 }
 
