@@ -11,9 +11,9 @@ use std::{
 };
 
 use gatsbi_models::{
-    checkpoint::{Checkpoint, FirstAction, Header, Precision, Provenance},
+    checkpoint::{AgentSlot, Checkpoint, FirstAction, Header, Precision, Provenance},
     config::presets,
-    world_model::Preprocess,
+    world_model::{ActionDimension, Preprocess},
 };
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
@@ -39,11 +39,17 @@ fn told(command: &mut Command) -> (Option<i32>, Vec<String>) {
 }
 
 fn checkpoint(folder: &Path, seed: u64) -> PathBuf {
+    let action = |i: i32| ActionDimension {
+        name: format!("a{i}"),
+        unit: String::new(),
+        offset: 0.0,
+        scale: 1.0,
+    };
     let header = Header {
         name: "tiny".to_owned(),
         model: presets::tiny(),
-        agent_slot: None,
-        actions: Vec::new(),
+        agent_slot: Some(AgentSlot { index: 0, score: None }),
+        actions: (0..7).map(action).collect(),
         preprocess: Preprocess::Stretch,
         frame_period: None,
         first_action: FirstAction::Neutral,
@@ -212,7 +218,8 @@ impl Running {
         let mut line = String::new();
         BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
         let address = |name: &str| {
-            let at = line.find(name).unwrap_or_else(|| panic!("{line}")) + name.len();
+            let log = || std::fs::read_to_string(&log).unwrap();
+            let at = line.find(name).unwrap_or_else(|| panic!("{line}{}", log())) + name.len();
             line[at..].split_whitespace().next().unwrap().to_owned()
         };
         let (http, admin) = (address("http="), address("admin="));

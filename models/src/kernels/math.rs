@@ -74,7 +74,7 @@ mod tests {
             assert!((f64::from(elu::<Plain>(x)) - expected).abs() < 2e-7 * expected.abs().max(1.0));
             close(sigmoid::<Plain>(x), 1.0 / (1.0 + (-exact).exp()), "sigmoid");
         }
-        assert_eq!(elu::<Plain>(-1e9), -1.0);
+        assert!((elu::<Plain>(-1e9) + 1.0).abs() < 1e-6);
         assert!(elu::<Plain>(f32::NAN).is_nan() && sigmoid::<Plain>(f32::NAN).is_nan());
     }
 }

@@ -243,7 +243,7 @@ mod tests {
         assert!(!told.contains(&secret), "{told}");
         let unknown = format!("[[keys]]\nsecret = \"{secret}\"\n");
         let told = read(&unknown).unwrap_err().to_string();
-        assert!(told.contains("line 2") && told.contains("unknown field"), "{told}");
+        assert!(told.contains("line 1") && told.contains("unknown field"), "{told}");
         assert!(!told.contains(&secret), "{told}");
     }
 

@@ -273,12 +273,13 @@ async fn what_is_anothers_looks_as_if_it_did_not_exist() {
         let id = if path.contains("/goals/") { &own.goal } else { &own.session };
         let none = invented(id);
         let request = |id: &str| {
-            let request = guarded.rest(&method, &path.replace("{id}", id));
+            let path = path.replace("{id}", id);
             if method == "put" && path.ends_with("/snapshot") {
                 let octets = ("content-type", "application/octet-stream");
-                return request.header(octets.0, octets.1).body(own.snapshot.clone());
+                let request = guarded.server.put(&path).header(octets.0, octets.1);
+                return request.body(own.snapshot.clone());
             }
-            request
+            guarded.rest(&method, &path)
         };
         let rival = Some(guarded.rival.as_str());
         let others = knock::rest(request(id), rival).await;
@@ -310,8 +311,12 @@ async fn a_goal_of_another_tenant_cannot_be_planned_for() {
         .await
         .unwrap();
     let session = opened["session"]["id"].as_str().unwrap();
-    let costs =
-        |goal: &str| json!({ "costs": { "terms": [{ "image_goal": { "goal_id": goal } }] } });
+    let costs = |goal: &str| {
+        json!({
+            "actions": { "dtype": "DATA_TYPE_F32", "shape": [1, 1, 7], "values": [0, 0, 0, 0, 0, 0, 0] },
+            "costs": { "terms": [{ "goal_image": { "goal_id": goal } }] },
+        })
+    };
     let path = format!("/v1/sessions/{session}/scores");
     let others = post(path.clone(), &guarded.rival, costs(&things.goal)).await.unwrap();
     let others: Json = others.json().await.unwrap();

@@ -176,7 +176,10 @@ pub(crate) async fn rest(request: reqwest::RequestBuilder, key: Option<&str>) ->
     };
     let response = request.send().await.unwrap();
     let code = response.status().as_u16().to_string();
-    let told = response.bytes().await.unwrap().to_vec();
+    // A feed does not end.
+    let is_feed =
+        response.headers().get("content-type").is_some_and(|it| it == "text/event-stream");
+    let told = if is_feed { vec![] } else { response.bytes().await.unwrap().to_vec() };
     let problem: serde_json::Value = serde_json::from_slice(&told).unwrap_or_default();
     let reason = problem["reason"].as_str().unwrap_or_default().to_owned();
     Answer { code, reason, told }

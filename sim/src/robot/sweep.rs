@@ -217,8 +217,8 @@ mod tests {
         }
         // The hand passes all of them, in order.
         for (_, goal) in &visits {
-            let passes = (0..1000).any(|_| {
-                hand = sweeps.next(hand, &OBJECTS, 0.04, 0.001);
+            let passes = (0..2000).any(|_| {
+                hand = sweeps.next(hand, &OBJECTS, 0.04, 0.005);
                 (hand - goal).norm() < 0.005
             });
             assert!(passes, "{goal}");
