@@ -1,4 +1,4 @@
-//! What can be wrong with a file of another format. Where it is wrong says [`Error::Import`](crate::Error::Import).
+//! What can be wrong with a file of another format. Where it is wrong says [`crate::Error::Import`].
 
 use std::path::Path;
 

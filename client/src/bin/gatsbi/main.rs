@@ -57,10 +57,10 @@ struct Shared {
     #[arg(long, value_name = "PATH", env = "GATSBI_CA", global = true)]
     ca: Option<PathBuf>,
     /// Own certificate (PEM), where the server asks for one
-    #[arg(long, value_name = "PATH", requires_all = ["key", "ca"], global = true)]
+    #[arg(long, value_name = "PATH", global = true)]
     certificate: Option<PathBuf>,
     /// Private key of the own certificate (PEM)
-    #[arg(long, value_name = "PATH", requires = "certificate", global = true)]
+    #[arg(long, value_name = "PATH", global = true)]
     key: Option<PathBuf>,
     /// Print JSON; errors, too, on standard error
     #[arg(long, global = true)]
@@ -116,13 +116,18 @@ async fn run(cli: Cli) -> anyhow::Result<()> {
 impl Shared {
     async fn client(&self) -> anyhow::Result<Client> {
         let read = |path: &PathBuf| fs_err::read(path);
+        // clap would not see one that stands before the command and another behind it together.
         let identity = match (&self.certificate, &self.key) {
             (Some(certificate), Some(key)) => Some((read(certificate)?, read(key)?)),
-            _ => None,
+            (None, None) => None,
+            _ => anyhow::bail!("--certificate and --key must be given together"),
         };
-        let tls = match &self.ca {
-            Some(ca) => Some(Tls { ca: read(ca)?, identity, server_name: None }),
-            None => None,
+        let tls = match (&self.ca, identity) {
+            (Some(ca), identity) => Some(Tls { ca: read(ca)?, identity, server_name: None }),
+            (None, Some(_)) => {
+                anyhow::bail!("--certificate needs --ca: without it no TLS is spoken")
+            }
+            (None, None) => None,
         };
         let api_key = self.api_key.clone();
         let options = Options { timeout: self.timeout, api_key, tls, ..Options::default() };
