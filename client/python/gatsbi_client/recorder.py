@@ -73,7 +73,7 @@ class Recorder:
     def close(self) -> None:
         """Completes the file and gives it its name."""
         if not self._file.closed:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.close()
             self._partial.replace(self._path)
 

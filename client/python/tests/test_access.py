@@ -4,7 +4,7 @@ import subprocess
 import pytest
 
 import gatsbi_client as gc
-from conftest import ROOT, serving
+from server import ROOT, serving
 
 
 def new_key(file, role):

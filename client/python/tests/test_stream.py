@@ -67,7 +67,7 @@ def test_a_wait_that_is_broken_off_leaves_no_answer_behind(address, frames, dime
             await stream.observe(frames[0])
             for step in (1, 2):
                 waiting = asyncio.ensure_future(stream.observe(frames[step], np.full(dimension, 0.1 * step)))
-                await asyncio.sleep(0.01 * step)
+                await asyncio.sleep(0.001 * step)
                 waiting.cancel()
                 with pytest.raises(asyncio.CancelledError):
                     await waiting
