@@ -2,6 +2,8 @@
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+mod checkpoint;
+
 use std::{
     io::{BufRead as _, BufReader},
     os::unix::fs::PermissionsExt as _,
@@ -10,11 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use gatsbi_models::{
-    checkpoint::{AgentSlot, Checkpoint, FirstAction, Header, Precision, Provenance},
-    config::presets,
-    world_model::{ActionDimension, Preprocess},
-};
+use checkpoint::checkpoint;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
 const ANY: &str = "127.0.0.1:0";
@@ -36,28 +34,6 @@ fn told(command: &mut Command) -> (Option<i32>, Vec<String>) {
     let text = String::from_utf8(output.stderr).unwrap();
     let errors = text.lines().filter(|line| line.starts_with("error: ")).map(str::to_owned);
     (output.status.code(), errors.collect())
-}
-
-fn checkpoint(folder: &Path, seed: u64) -> PathBuf {
-    let action = |i: i32| ActionDimension {
-        name: format!("a{i}"),
-        unit: String::new(),
-        offset: 0.0,
-        scale: 1.0,
-    };
-    let header = Header {
-        name: "tiny".to_owned(),
-        model: presets::tiny(),
-        agent_slot: Some(AgentSlot { index: 0, score: None }),
-        actions: (0..7).map(action).collect(),
-        preprocess: Preprocess::Stretch,
-        frame_period: None,
-        first_action: FirstAction::Neutral,
-        provenance: Provenance { seed, ..Provenance::default() },
-    };
-    let path = folder.join("tiny.safetensors");
-    Checkpoint::untrained(header, tch::Device::Cpu).save(&path, Precision::Half).unwrap();
-    path
 }
 
 fn write(folder: &Path, name: &str, text: &str, mode: u32) -> PathBuf {

@@ -2,41 +2,17 @@
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
+mod checkpoint;
+
 use std::{
     io::{BufRead as _, BufReader, Read as _},
     process::{Command, Stdio},
 };
 
-use gatsbi_models::{
-    checkpoint::{AgentSlot, Checkpoint, FirstAction, Header, Precision, Provenance},
-    config::presets,
-    world_model::{ActionDimension, Preprocess},
-};
+use checkpoint::checkpoint;
 use serde_json::{Value as Json, json};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
-
-fn checkpoint(folder: &std::path::Path) -> std::path::PathBuf {
-    let action = |i: i32| ActionDimension {
-        name: format!("a{i}"),
-        unit: String::new(),
-        offset: 0.0,
-        scale: 1.0,
-    };
-    let header = Header {
-        name: "tiny".to_owned(),
-        model: presets::tiny(),
-        agent_slot: Some(AgentSlot { index: 0, score: None }),
-        actions: (0..7).map(action).collect(),
-        preprocess: Preprocess::Stretch,
-        frame_period: None,
-        first_action: FirstAction::Neutral,
-        provenance: Provenance::default(),
-    };
-    let path = folder.join("tiny.safetensors");
-    Checkpoint::untrained(header, tch::Device::Cpu).save(&path, Precision::Half).unwrap();
-    path
-}
 
 #[test]
 fn it_serves_until_it_is_told_to_end() {
@@ -48,7 +24,7 @@ fn it_serves_until_it_is_told_to_end() {
         .env_remove("OMP_WAIT_POLICY")
         .args(["--grpc-listen", any, "--http-listen", any, "--admin-listen", any])
         .arg("--checkpoint")
-        .arg(format!("arm={}", checkpoint(folder.path()).display()))
+        .arg(format!("arm={}", checkpoint(folder.path(), 0).display()))
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
@@ -146,7 +122,7 @@ impl Drop for Program {
 #[test]
 fn a_session_moves_from_one_process_to_another() {
     let folder = tempfile::tempdir().unwrap();
-    let checkpoint = checkpoint(folder.path());
+    let checkpoint = checkpoint(folder.path(), 0);
     let (here, there) = (Program::start(&checkpoint), Program::start(&checkpoint));
     let opened = here.call(reqwest::Method::POST, "/v1/sessions", &json!({ "seed": 3 }));
     let session = opened["session"]["id"].as_str().unwrap();
