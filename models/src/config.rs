@@ -300,6 +300,9 @@ pub struct ObjectConfig {
     pub interaction: Interaction,
     /// Which state of the agent the objects see.
     pub agent_history: AgentHistory,
+    /// Which step's agent and environment an object's motion depends on.
+    #[serde(default)]
+    pub agent_feature: AgentFeature,
 }
 
 /// Residual image encoder.
@@ -425,6 +428,19 @@ pub enum AgentHistory {
     After,
     /// The prior state before that.
     Before,
+}
+
+/// Which step's agent and environment move an object to where it is at step t (decisions row 13).
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AgentFeature {
+    /// Those of t - 1: an object remembers a step as soon as it is over (the original's order). What the robot does
+    /// moves an object one step late.
+    #[default]
+    Current,
+    /// Those of t: an object remembers a step when the next one begins, beside the agent and the `mu_mix` of that one.
+    /// They are known then even in imagination, because agent and background step first.
+    Next,
 }
 
 impl GatsbiConfig {

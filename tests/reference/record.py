@@ -97,6 +97,7 @@ MODEL: dict[str, Any] = {
         "graph": {"kind": "knn", "k": 3, "metric": "distance", "aggregate": "attention"},
         "interaction": {"kind": "inter3", "outputs": 7, "celu": False},
         "agent_history": "after",
+        "agent_feature": "current",
     },
     "tracking": {
         "discovery": "every_frame",
@@ -232,6 +233,7 @@ CASES: dict[str, Micro] = {
                 "graph": {"kind": "knn", "k": 3, "metric": "weight", "aggregate": "attention"},
                 "interaction": {"kind": "inter3", "outputs": 7, "celu": True},
                 "agent_history": "before",
+                "agent_feature": "next",
             },
             "tracking": {"presence": "product"},
         },

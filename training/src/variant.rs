@@ -3,7 +3,7 @@
 use anyhow::ensure;
 use clap::ValueEnum;
 use gatsbi_models::config::{
-    GatsbiConfig, Graph, Interaction, KnnAggregate, KnnMetric, ObjectConfig,
+    AgentFeature, GatsbiConfig, Graph, Interaction, KnnAggregate, KnnMetric, ObjectConfig,
 };
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +42,10 @@ pub enum Variant {
     Knn3,
     /// Objects see their five nearest neighbours.
     Knn5,
+    /// The agent moves objects one step late, as in the original.
+    AgentCurrent,
+    /// The agent moves objects in the same step.
+    AgentNext,
     /// The keypoints' dynamics do not teach the network that enhances actions (paper's supplement E.6).
     KeypointsApart,
 }
@@ -54,7 +58,7 @@ impl Variant {
 
     /// Turns its switch in an architecture.
     pub fn apply(self, model: &mut GatsbiConfig) {
-        let ObjectConfig { interaction, graph, .. } = &mut model.objects;
+        let ObjectConfig { interaction, graph, agent_feature, .. } = &mut model.objects;
         // As wide as what it replaces, where that merged an agent too.
         let outputs = match *interaction {
             Interaction::Inter1 => model.action.enhanced,
@@ -70,6 +74,8 @@ impl Variant {
             Self::Fc => *graph = Graph::FullyConnected,
             Self::Knn3 => *graph = knn(3),
             Self::Knn5 => *graph = knn(5),
+            Self::AgentCurrent => *agent_feature = AgentFeature::Current,
+            Self::AgentNext => *agent_feature = AgentFeature::Next,
         }
     }
 

@@ -1,7 +1,7 @@
 //! Named sizes: the paper's data sets and `tiny`.
 
 use super::{
-    ActionConfig, AgentHistory, CompDecoderConfig, CompEncoderConfig, CompNorm, DetectorConfig,
+    ActionConfig, AgentFeature, AgentHistory, CompDecoderConfig, CompEncoderConfig, CompNorm, DetectorConfig,
     DiscoveryPrior, EncoderConfig, GammaForm, GatsbiConfig, GlimpseCodecConfig, Graph,
     ImageEncoderConfig, InitScheme, Interaction, KnnAggregate, KnnMetric, MaskDecoderConfig,
     MixtureConfig, ObjectConfig, SubPixelStage, Tracking, UpdateConfig,
@@ -213,6 +213,7 @@ fn objects(grid: i64, max_objects: i64) -> ObjectConfig {
         graph: knn(3),
         interaction: Interaction::Inter3 { outputs: 32, celu: false },
         agent_history: AgentHistory::After,
+        agent_feature: AgentFeature::Current,
     }
 }
 

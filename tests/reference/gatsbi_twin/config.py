@@ -166,6 +166,8 @@ class ObjectConfig:
     interaction: InteractionConfig
     agent_history: str
     """`after` or `before`."""
+    agent_feature: str
+    """`current` or `next`."""
 
     @property
     def z_width(self) -> int:

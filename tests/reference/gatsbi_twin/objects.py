@@ -90,11 +90,14 @@ class ObjectModule(nn.Module):
 
         `discover` says for all rows together, or for each in a [B] bool tensor, whether to look for new ones.
         """
-        propagated = self.propagation.observe(
-            state.z, state.post[0], state.prior[0], scenery.frame, noise, tracking
-        )
+        post, prior = state.post, state.prior
+        late = self.config.agent_feature == "next"
+        if late:
+            post, prior = self._remember(state.z, post, prior, scenery.background, scenery.agent)
+        propagated = self.propagation.observe(state.z, post[0], prior[0], scenery.frame, noise, tracking)
         z = propagated.latents.join()
-        post, prior = self._remember(z, state.post, state.prior, scenery.background, scenery.agent)
+        if not late:
+            post, prior = self._remember(z, post, prior, scenery.background, scenery.agent)
         candidates = ObjectState(z, post, prior, state.ids, state.next_id)
         order, proposal = z[..., 0], propagated.proposal
         kl = self._kl_known(propagated, state.ids >= 0)
@@ -127,10 +130,15 @@ class ObjectModule(nn.Module):
 
         Only the prior's memory moves, unless `remember_post`: then the posterior's is fed the same latents.
         """
-        z = self.propagation.imagine(state.z, state.prior[0], noise, tracking)
+        late = self.config.agent_feature == "next"
+        z, prior = state.z, state.prior
+        if not late:
+            z = self.propagation.imagine(z, prior[0], noise, tracking)
         environment = self.surroundings.environment(z, background)
-        prior = self._move(self.prior, z, state.prior, environment, agent)
+        prior = self._move(self.prior, z, prior, environment, agent)
         post = self._move(self.post, z, state.post, environment, agent) if remember_post else state.post
+        if late:
+            z = self.propagation.imagine(z, prior[0], noise, tracking)
         return ObjectState(z, post, prior, state.ids, state.next_id)
 
     def render(self, z: Tensor) -> Rendering:
@@ -142,7 +150,10 @@ class ObjectModule(nn.Module):
         z = found.latents.join()
         batch, cells, _ = z.shape
         start = (self.post.start(batch, cells), self.prior.start(batch, cells))
-        post, prior = self._remember(z, *start, scenery.background, scenery.agent)
+        if self.config.agent_feature == "next":
+            post, prior = start
+        else:
+            post, prior = self._remember(z, *start, scenery.background, scenery.agent)
         ids = next_id[:, None] + torch.arange(cells, device=z.device)
         return ObjectState(z, post, prior, ids, next_id)
 

@@ -30,7 +30,7 @@ use self::{
 };
 use super::mixture::Memory;
 use crate::{
-    config::{DiscoveryPrior, GatsbiConfig, IdRule, Tracking},
+    config::{AgentFeature, DiscoveryPrior, GatsbiConfig, IdRule, Tracking},
     nn::Path,
     noise::Noise,
 };
@@ -131,6 +131,7 @@ pub struct ObjectModule {
     prior: ObjectMemory,
     decoder: GlimpseDecoder,
     layout: Layout,
+    agent_feature: AgentFeature,
     max_objects: i64,
     image_size: i64,
 }
@@ -149,6 +150,7 @@ impl ObjectModule {
             prior: memory("prior"),
             decoder: GlimpseDecoder::new(&path.sub("glimpse_decoder"), objects),
             layout,
+            agent_feature: objects.agent_feature,
             max_objects: objects.max_objects,
             image_size: config.image_size,
         }
@@ -180,11 +182,21 @@ impl ObjectModule {
         tracking: &Tracking,
         train: bool,
     ) -> (ObjectState, ObjectStep) {
-        let (h_post, h_prior) = (&state.post.h, &state.prior.h);
-        let propagated =
-            self.propagation.posterior(&state.z, h_post, h_prior, scenery.frame, noise, tracking);
-        let [post, prior] =
-            self.remember(&propagated.z, [&state.post, &state.prior], scenery, None);
+        let memories = [&state.post, &state.prior];
+        let track = |[post, prior]: [&Memory; 2]| {
+            self.propagation.posterior(&state.z, &post.h, &prior.h, scenery.frame, noise, tracking)
+        };
+        let (propagated, [post, prior]) = match self.agent_feature {
+            AgentFeature::Current => {
+                let propagated = track(memories);
+                let memories = self.remember(&propagated.z, memories, scenery, None);
+                (propagated, memories)
+            }
+            AgentFeature::Next => {
+                let memories = self.remember(&state.z, memories, scenery, None);
+                (track(memories.each_ref()), memories)
+            }
+        };
         let discovered = (!matches!(discover, Discover::None)).then(|| {
             let difference = scenery.frame - scenery.residual_mix;
             let input = Tensor::cat(&[scenery.frame, &difference], 1);
@@ -209,13 +221,26 @@ impl ObjectModule {
         noise: &dyn Noise,
         tracking: &Tracking,
     ) -> ObjectState {
-        let z = self.propagation.generate(&state.z, &state.prior.h, noise, tracking);
-        let environment = self.surroundings.environment(mu_mix, &place(&z));
-        let prior = self.advance(&self.prior, &z, &state.prior, &environment, agent, None);
-        let post = state.post.shallow_clone();
+        let remember = |z: &Tensor| {
+            let environment = self.surroundings.environment(mu_mix, &place(z));
+            self.advance(&self.prior, z, &state.prior, &environment, agent, None)
+        };
+        let carry_on =
+            |memory: &Memory| self.propagation.generate(&state.z, &memory.h, noise, tracking);
+        let (z, prior) = match self.agent_feature {
+            AgentFeature::Current => {
+                let z = carry_on(&state.prior);
+                let prior = remember(&z);
+                (z, prior)
+            }
+            AgentFeature::Next => {
+                let prior = remember(&state.z);
+                (carry_on(&prior), prior)
+            }
+        };
         ObjectState {
             z,
-            post,
+            post: state.post.shallow_clone(),
             prior,
             ids: state.ids.shallow_clone(),
             next_id: state.next_id.shallow_clone(),
@@ -232,8 +257,12 @@ impl ObjectModule {
         tracking: &Tracking,
     ) -> ObjectState {
         let next = self.imagine(state, mu_mix, agent, noise, tracking);
-        let environment = self.surroundings.environment(mu_mix, &place(&next.z));
-        let post = self.advance(&self.post, &next.z, &state.post, &environment, agent, None);
+        let z = match self.agent_feature {
+            AgentFeature::Current => &next.z,
+            AgentFeature::Next => &state.z,
+        };
+        let environment = self.surroundings.environment(mu_mix, &place(z));
+        let post = self.advance(&self.post, z, &state.post, &environment, agent, None);
         ObjectState { post, ..next }
     }
 
@@ -309,8 +338,15 @@ impl ObjectModule {
         let slot_rows = (&order - cells).clamp_min(0);
 
         let batch = candidates.z.size()[0];
-        let fresh = [&self.post.initial(batch, cells), &self.prior.initial(batch, cells)];
-        let [new_post, new_prior] = self.remember(&candidates.z, fresh, scenery, Some(&cell_rows));
+        let [new_post, new_prior] = match self.agent_feature {
+            AgentFeature::Current => {
+                let fresh = [&self.post.initial(batch, cells), &self.prior.initial(batch, cells)];
+                self.remember(&candidates.z, fresh, scenery, Some(&cell_rows))
+            }
+            AgentFeature::Next => {
+                [&self.post, &self.prior].map(|memory| memory.initial(batch, self.max_objects))
+            }
+        };
         let mask = is_new.unsqueeze(-1);
         let old = |x: &Tensor| gather_rows(x, &slot_rows);
         let merge = |new: &Memory, known: &Memory| Memory {
