@@ -184,7 +184,7 @@ fn add_scene(
     let mut state = model.initial_state(rows);
     for (t, frame) in batch.frames.iter().enumerate() {
         let first = state.first();
-        let dropout = objects.map_or(0.0, |objects| objects.discovery_dropout);
+        let dropout = objects.map_or(0.0, |objects| objects.discovery_dropout.at(moment.step));
         let discover =
             if t > 0 && dropped(moment, t, dropout) { Discover::None } else { Discover::All };
         let how = Observing {

@@ -200,8 +200,9 @@ pub struct ObjectRecipe {
     pub kl: Ramp,
     /// Constant alpha of the composite and the step it ends.
     pub fixed_alpha: Option<FixedAlpha>,
-    /// Probability of discovering nothing at a frame after the first.
-    pub discovery_dropout: f64,
+    /// Probability of discovering nothing at a frame after the first. While it is small, an object that moves is let go
+    /// and found anew, and nothing learns to follow it.
+    pub discovery_dropout: Ramp,
     /// Mean of the raw scale in the discovery prior.
     pub scale_mean: Ramp,
 }

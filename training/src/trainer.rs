@@ -128,7 +128,8 @@ impl Trainer {
         if self.progress.step == 0 {
             let loaded = Checkpoint::load(path, self.device)?;
             let header = self.checkpoint.header.clone();
-            let mut theirs = GatsbiConfig { tracking: header.model.tracking, ..loaded.header.model };
+            let mut theirs =
+                GatsbiConfig { tracking: header.model.tracking, ..loaded.header.model };
             // Neither decides what parameters there are.
             theirs.objects.agent_feature = header.model.objects.agent_feature;
             ensure!(theirs == header.model, "{} has another architecture", path.display());

@@ -1,9 +1,9 @@
 //! Named sizes: the paper's data sets and `tiny`.
 
 use super::{
-    ActionConfig, AgentFeature, AgentHistory, CompDecoderConfig, CompEncoderConfig, CompNorm, DetectorConfig,
-    DiscoveryPrior, EncoderConfig, GammaForm, GatsbiConfig, GlimpseCodecConfig, Graph,
-    ImageEncoderConfig, InitScheme, Interaction, KnnAggregate, KnnMetric, MaskDecoderConfig,
+    ActionConfig, AgentFeature, AgentHistory, CompDecoderConfig, CompEncoderConfig, CompNorm,
+    DetectorConfig, DiscoveryPrior, EncoderConfig, GammaForm, GatsbiConfig, GlimpseCodecConfig,
+    Graph, ImageEncoderConfig, InitScheme, Interaction, KnnAggregate, KnnMetric, MaskDecoderConfig,
     MixtureConfig, ObjectConfig, SubPixelStage, Tracking, UpdateConfig,
 };
 
@@ -113,6 +113,8 @@ pub fn tiny() -> GatsbiConfig {
             },
             // What detectors call the same object by convention: at 0.8 many boxes are second ones on a known object.
             rejection: Some(0.5),
+            // An action moves the hand and what it pushes in the same step.
+            agent_feature: AgentFeature::Next,
             ..objects(4, 7)
         },
         tracking: Tracking::serving(),

@@ -3,6 +3,7 @@
 pub mod decomposition;
 pub mod images;
 pub mod interaction;
+pub mod motion;
 pub mod perceptual;
 pub mod picture;
 pub mod plot;

@@ -16,6 +16,7 @@ use tch::Tensor;
 use super::{
     CONDITIONING, Draw, Recorded, decomposition, images,
     interaction::Followed,
+    motion::Starts,
     perceptual::{Perceptual, frechet_distance},
     rollout,
     statistics::{Estimate, PerEpisode},
@@ -154,19 +155,31 @@ pub fn report(
         let others = rollout(world, &recorded, &swapped, Draw::Mean, only_frames);
         let first_episode = chunk * BATCH;
         let mut identities = HashMap::new();
-        let mut followed = Vec::new();
+        let (mut followed, mut starts) = (Vec::new(), Vec::new());
         for t in 0..length {
             let at = At { t, first_episode };
             add_images(&mut tally, &recorded, &scenes, &others, at);
             if let Some(perceptual) = perceptual {
                 add_perceptual(&mut tally, perceptual, &recorded, &scenes, at);
             }
-            if recorded.labels.is_some() {
+            if let Some(labels) = &recorded.labels {
+                let labels = |row: usize| labels[t].get(row as i64);
                 let matches =
                     add_decomposition(&mut tally, &recorded, &scenes[t], spec, at, &mut identities);
                 if t + 1 == CONDITIONING {
                     followed = matches.iter().map(|matches| Followed::new(matches)).collect();
+                    let start = |(row, matches): (usize, &Vec<_>)| {
+                        Starts::new(matches, &scenes[t], &labels(row), row as i64)
+                    };
+                    starts = matches.iter().enumerate().map(start).collect();
                 } else if t >= CONDITIONING {
+                    for (row, starts) in starts.iter().enumerate() {
+                        let motion = starts.step(&scenes[t], &labels(row), row as i64);
+                        let episode = first_episode + row;
+                        let moved = motion.moved as f64;
+                        tally.ratio("moved_object_px_imagined", episode, motion.error, moved);
+                        tally.ratio("moved_object_px_still", episode, motion.still, moved);
+                    }
                     add_interactions(&mut tally, &recorded, &scenes[t], at, &mut followed);
                 }
             }

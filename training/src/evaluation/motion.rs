@@ -1,0 +1,122 @@
+//! How much of the objects' motion is foreseen: imagined displacements since the last observed frame beside the true ones,
+//! of objects that did move.
+
+use std::collections::BTreeMap;
+
+use gatsbi_models::scene::Scene;
+use tch::Tensor;
+
+use super::decomposition::{found_objects, true_objects};
+
+/// An object has moved when its centre is this far from where it was, in pixels.
+const MOVED_PIXELS: f64 = 2.0;
+
+type Point = [f64; 2];
+
+/// The objects of one episode at the last observed frame.
+#[derive(Debug)]
+pub struct Starts {
+    /// Identity, found and true centre by label.
+    objects: BTreeMap<i64, (i64, Point, Point)>,
+}
+
+/// Over objects that have moved: how many, and sums of distances in pixels.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Motion {
+    /// Objects that have moved and are still imagined.
+    pub moved: usize,
+    /// Between the imagined displacement and the true one.
+    pub error: f64,
+    /// Between none and the true one.
+    pub still: f64,
+}
+
+impl Starts {
+    /// Of row `row` with labels `[H, W]` and the `(label, identity)` pairs matched there.
+    pub fn new(matches: &[(i64, i64)], scene: &Scene, labels: &Tensor, row: i64) -> Self {
+        let (found, truth) = centres(scene, labels, row);
+        let objects = matches.iter().filter_map(|(label, identity)| {
+            Some((*label, (*identity, *found.get(identity)?, *truth.get(label)?)))
+        });
+        Self { objects: objects.collect() }
+    }
+
+    /// What has moved up to an imagined frame whose labels are `[H, W]`.
+    pub fn step(&self, scene: &Scene, labels: &Tensor, row: i64) -> Motion {
+        let (found, truth) = centres(scene, labels, row);
+        let mut motion = Motion::default();
+        for (label, (identity, found_then, truth_then)) in &self.objects {
+            let (Some(found), Some(truth)) = (found.get(identity), truth.get(label)) else {
+                continue;
+            };
+            let (imagined, actual) = (minus(found, found_then), minus(truth, truth_then));
+            let still = length(actual);
+            if still >= MOVED_PIXELS {
+                motion.moved += 1;
+                motion.error += length(minus(&imagined, &actual));
+                motion.still += still;
+            }
+        }
+        motion
+    }
+}
+
+/// Centres by identity and by label.
+fn centres(
+    scene: &Scene,
+    labels: &Tensor,
+    row: i64,
+) -> (BTreeMap<i64, Point>, BTreeMap<i64, Point>) {
+    let found = found_objects(scene, row, labels.size()[0] as f64);
+    (found.into_iter().collect(), true_objects(labels).into_iter().collect())
+}
+
+fn minus(a: &Point, b: &Point) -> Point {
+    [a[0] - b[0], a[1] - b[1]]
+}
+
+fn length([x, y]: Point) -> f64 {
+    x.hypot(y)
+}
+
+#[cfg(test)]
+mod tests {
+    use gatsbi_models::scene::ObjectTable;
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    /// A scene with objects 7 and 9 at these columns of row 31.5.
+    fn scene(columns: [f64; 2]) -> Scene {
+        let x = |pixel: f64| (pixel + 0.5) * 2.0 / 64.0 - 1.0;
+        let row = |pixel: f64| [1.0, x(pixel), x(31.5), 0.1, 0.1, 0.0];
+        let values = columns.map(row).concat();
+        Scene {
+            objects: Some(ObjectTable {
+                ids: Tensor::from_slice(&[7i64, 9]).view([1, 2]),
+                values: Tensor::from_slice(&values).to_kind(Kind::Float).view([1, 2, 6]),
+            }),
+            ..Scene::default()
+        }
+    }
+
+    /// Labels with objects 2 and 3 beginning at these columns.
+    fn labels(left: [i64; 2]) -> Tensor {
+        let labels = Tensor::zeros([64, 64], (Kind::Int64, Device::Cpu));
+        for (label, left) in [2, 3].into_iter().zip(left) {
+            let _ = labels.narrow(0, 30, 4).narrow(1, left, 4).fill_(label);
+        }
+        labels
+    }
+
+    #[test]
+    fn displacements_are_compared_wherever_the_object_was_found() {
+        // Object 7 was found one pixel beside its true place, which is column 9.5.
+        let starts = Starts::new(&[(2, 7), (3, 9)], &scene([10.5, 41.5]), &labels([8, 40]), 0);
+        // Label 2 moves by six pixels and is imagined to move by four; label 3 rests.
+        let motion = starts.step(&scene([14.5, 47.5]), &labels([14, 40]), 0);
+        assert_eq!(motion.moved, 1);
+        assert!((motion.error - 2.0).abs() < 1e-4, "{motion:?}");
+        assert!((motion.still - 6.0).abs() < 1e-4, "{motion:?}");
+    }
+}
