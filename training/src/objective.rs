@@ -6,7 +6,7 @@ use gatsbi_models::{
         keypoint::{KeypointLearning, Keypoints},
         loss,
         mixture::MixtureStep,
-        model::{Gatsbi, GradientStops, Observing},
+        model::{Gatsbi, GatsbiState, GradientStops, Observing},
         objects::{Discover, ObjectStep, Rendering},
     },
     noise::{Noise, PhiloxNoise, RowNoise, Site, philox4x32_10},
@@ -223,6 +223,9 @@ fn add_scene(
         add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
         if let (Some(objects), Some(rendering)) = (objects, &rendering) {
             add_composite(terms, objects, rendering, &seen.mixture, frame, moment.step, phase);
+            if t > 0 {
+                add_following(terms, model, objects, (&state, &seen.mixture), frame, moment.step);
+            }
             if let Some(found) = &seen.objects {
                 add_objects_kl(terms, model, objects, found, &first, moment.step);
             }
@@ -352,6 +355,32 @@ fn add_composite(
     }
     let alpha = rendering.alpha.mean_dim([1i64, 2, 3].as_slice(), false, Kind::Float);
     terms.add("alpha", alpha, 0.0);
+}
+
+/// How near discovery must find an object to draw it, in pixels: less than the distance of neighbours.
+const FOLLOWING_REACH: f64 = 3.0;
+
+/// Leads followed and imagined objects to what discovery finds.
+fn add_following(
+    terms: &mut Terms,
+    model: &Gatsbi,
+    recipe: &ObjectRecipe,
+    (state, mixture): (&GatsbiState, &MixtureStep),
+    frame: &Tensor,
+    step: u64,
+) {
+    let weight = recipe.following.at(step);
+    if weight > 0.0 {
+        let place = |z: &Tensor| {
+            let pixels = model.config().image_size as f64 / 2.0;
+            (z.narrow(-1, 0, 1), model.objects().drawn_centres(z) * pixels)
+        };
+        let found = tch::no_grad(|| place(&model.objects().detect(frame, &mixture.mu_mix)));
+        let objects = place(&state.objects.z);
+        let distance =
+            loss::following((&objects.0, &objects.1), (&found.0, &found.1), FOLLOWING_REACH);
+        terms.add("following", distance, weight);
+    }
 }
 
 fn add_objects_kl(

@@ -232,6 +232,11 @@ impl Gatsbi {
         (state, GatsbiStep { mixture: step, objects: None })
     }
 
+    /// The object module.
+    pub fn objects(&self) -> &ObjectModule {
+        &self.objects
+    }
+
     /// Draws the objects of a state.
     pub fn render(&self, state: &GatsbiState) -> Rendering {
         self.objects.render(&state.objects.z)

@@ -32,7 +32,7 @@ use super::mixture::Memory;
 use crate::{
     config::{AgentFeature, DiscoveryPrior, GatsbiConfig, IdRule, Tracking},
     nn::Path,
-    noise::Noise,
+    noise::{Noise, PhiloxNoise},
 };
 
 /// The objects of a batch of sessions, always MAX slots, empty ones with presence 0.
@@ -264,6 +264,22 @@ impl ObjectModule {
         let environment = self.surroundings.environment(mu_mix, &place(z));
         let post = self.advance(&self.post, z, &state.post, &environment, agent, None);
         ObjectState { post, ..next }
+    }
+
+    /// What discovery finds in a frame if nothing is known yet: latent vectors `[B, G², Z]` at their means, of which the
+    /// present ones are objects.
+    pub fn detect(&self, frame: &Tensor, mu_mix: &Tensor) -> Tensor {
+        let batch = frame.size()[0];
+        let input = Tensor::cat(&[frame, &(frame - mu_mix)], 1);
+        let nothing = self.initial_state(batch).z;
+        let noise = PhiloxNoise::mean(batch, frame.device());
+        self.discovery.posterior(&input, &nothing, &noise, false).z
+    }
+
+    /// Centres x, y in [-1, 1] of what is drawn in the boxes of objects `z [B, N, Z]`, `[B, N, 2]`: a box need not be
+    /// centred on its object. Their gradient is that of the boxes' centres.
+    pub fn drawn_centres(&self, z: &Tensor) -> Tensor {
+        render::drawn_centres(&self.decoder, z, self.layout)
     }
 
     /// Draws objects `z [B, N, Z]` into images.

@@ -6,7 +6,7 @@ use super::{
     glimpse::GlimpseDecoder,
     latents::{Latents, Layout},
 };
-use crate::nn::spatial_transformer::place;
+use crate::nn::spatial_transformer::{pixel_centres, place};
 
 /// Keeps the normalisation of importance finite where no object is.
 const EPS: f64 = 1e-5;
@@ -41,6 +41,22 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
     }
 }
 
+/// Centres `[B, N, 2]` of what is drawn for objects `z [B, N, Z]`; only the boxes' centres have a gradient.
+pub(crate) fn drawn_centres(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Tensor {
+    let Latents { place, what, .. } = layout.split(z);
+    let within = tch::no_grad(|| {
+        let alpha = decoder.forward(&what).select(2, 3); // [B, N, s, s]
+        let line = pixel_centres(alpha.size()[3], &alpha);
+        let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
+        let centre = |across: i64| {
+            let along = alpha.sum_dim_intlist(across, false, Kind::Float);
+            (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
+        };
+        Tensor::stack(&[centre(2), centre(3)], -1) * place.narrow(-1, 0, 2)
+    });
+    place.narrow(-1, 2, 2) + within
+}
+
 impl Rendering {
     /// The objects' colours without their alpha, `[B, 3, H, W]`; meaningless where `alpha` is 0.
     pub fn colour(&self) -> Tensor {
@@ -50,5 +66,36 @@ impl Rendering {
     /// `mu_t = mu^o + (1 - alpha) mu_mix`, `[B, 3, H, W]`.
     pub fn over(&self, mu_mix: &Tensor) -> Tensor {
         &self.foreground + (1.0 - &self.alpha) * mu_mix
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::{config::presets, nn::ParamStore};
+
+    #[test]
+    fn the_drawn_centre_is_the_centre_of_the_drawn_alpha() {
+        let config = presets::tiny().objects;
+        let layout = Layout { what: config.z_what, dyna: config.z_dyna };
+        let mut store = ParamStore::new(1, Device::Cpu);
+        let decoder = store.build(|root| GlimpseDecoder::new(root, &config));
+        let _no_grad = tch::no_grad_guard();
+        let box_and_depth = Tensor::from_slice(&[1f32, 0.0, 0.5, 0.25, 0.1, -0.3]);
+        let rest = Tensor::randn([config.z_what + config.z_dyna], (Kind::Float, Device::Cpu)) * 3.0;
+        let z = Tensor::cat(&[box_and_depth, rest], 0).view([1, 1, -1]);
+        let alpha = render(&decoder, &z, layout, 128).alpha.view([128, 128]);
+        let line = pixel_centres(128, &alpha);
+        let centre = |across: i64| {
+            let along = alpha.sum_dim_intlist(across, false, Kind::Float);
+            ((along * &line).sum(Kind::Float) / alpha.sum(Kind::Float)).double_value(&[])
+        };
+        let found = drawn_centres(&decoder, &z, layout);
+        for (axis, across) in [(0, 0), (1, 1)] {
+            let difference = found.double_value(&[0, 0, axis]) - centre(across);
+            assert!(difference.abs() < 5e-3, "axis {axis}: {difference}");
+        }
     }
 }
