@@ -40,6 +40,10 @@ pub struct Tracking {
     /// Bounds that keep the size of a box, as a fraction of the image, sensible in sessions and rollouts far
     /// longer than any training sequence.
     pub scale_bounds: Option<(f64, f64)>,
+    /// Intersection over union above which two tracked boxes count as one object, of which the one known longer is kept;
+    /// `None` keeps both.
+    #[serde(default)]
+    pub merge: Option<f64>,
 }
 
 impl Tracking {
@@ -50,6 +54,7 @@ impl Tracking {
             presence: PresenceRule::Hold,
             ids: IdRule::Monotone,
             scale_bounds: Some((0.01, 1.5)),
+            merge: None,
         }
     }
 
@@ -60,6 +65,7 @@ impl Tracking {
             presence: PresenceRule::Product,
             ids: IdRule::Original,
             scale_bounds: None,
+            merge: None,
         }
     }
 }

@@ -104,10 +104,11 @@ MODEL: dict[str, Any] = {
         "presence": "hold",
         "ids": "monotone",
         "scale_bounds": [0.15, 0.6],
+        "merge": None,
     },
 }
 
-ORIGINAL = {"discovery": "first_frame", "presence": "product", "ids": "original", "scale_bounds": None}
+ORIGINAL = {"discovery": "first_frame", "presence": "product", "ids": "original", "scale_bounds": None, "merge": None}
 
 OBSERVE, MEAN = Step("observe"), Step("observe", noise="mean")
 IMAGINE, SKIP = Step("imagine"), Step("skip")
@@ -235,7 +236,7 @@ CASES: dict[str, Micro] = {
                 "agent_history": "before",
                 "agent_feature": "next",
             },
-            "tracking": {"presence": "product"},
+            "tracking": {"presence": "product", "merge": 0.3},
         },
         agent_slot=0,
         batch=2,

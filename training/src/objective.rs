@@ -65,13 +65,15 @@ impl Terms {
     }
 }
 
-/// How objects are tracked in training: presence is the original product, and new objects come as told.
-pub fn training_tracking(scale_bounds: Option<(f64, f64)>) -> Tracking {
+/// How objects are tracked in training: presence is the original product, and new objects come as told; bounds and merging
+/// are those of the recipe.
+pub fn training_tracking(objects: Option<&ObjectRecipe>) -> Tracking {
     Tracking {
         discovery: DiscoveryPolicy::EveryFrame,
         presence: PresenceRule::Product,
         ids: IdRule::Monotone,
-        scale_bounds,
+        scale_bounds: objects.and_then(|objects| objects.scale_bounds),
+        merge: objects.and_then(|objects| objects.merge),
     }
 }
 
@@ -179,7 +181,7 @@ fn add_scene(
     let device = batch.frames[0].device();
     let objects = recipe.objects.as_ref().filter(|objects| moment.step >= objects.start);
     let alone = recipe.objects_alone(moment.step);
-    let tracking = training_tracking(objects.and_then(|objects| objects.scale_bounds));
+    let tracking = training_tracking(objects);
     let observed = batch.frames.len() - recipe.imagined.at(moment.step) as usize;
     let mut state = model.initial_state(rows);
     for (t, frame) in batch.frames.iter().enumerate() {

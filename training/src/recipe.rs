@@ -190,6 +190,8 @@ pub struct ObjectRecipe {
     /// Bounds of a box's side as a fraction of the image. Without them a few faint boxes grow over the whole
     /// image and correct the background's colours, instead of being objects.
     pub scale_bounds: Option<(f64, f64)>,
+    /// Overlap above which two boxes are one object ([`gatsbi_models::config::Tracking::merge`]).
+    pub merge: Option<f64>,
     /// Standard deviation of both likelihoods below.
     pub sigma: f64,
     /// Weight of the Gaussian likelihood of the composite image.

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use gatsbi_models::{
     checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
-    config::{GatsbiConfig, presets},
+    config::{GatsbiConfig, Tracking, presets},
     gatsbi::{
         keypoint::KeypointLearning,
         model::{GradientStops, Observing},
@@ -82,8 +82,10 @@ impl Trainer {
         );
         model.action.dim = clips.actions.len() as i64;
         recipe.variant.apply(&mut model);
-        if let Some(bounds) = recipe.objects.as_ref().and_then(|objects| objects.scale_bounds) {
-            model.tracking.scale_bounds = Some(bounds);
+        if let Some(objects) = &recipe.objects {
+            let Tracking { scale_bounds, merge, .. } = training_tracking(Some(objects));
+            model.tracking.scale_bounds = scale_bounds.or(model.tracking.scale_bounds);
+            model.tracking.merge = merge;
         }
         let mut header = untrained::header(&recipe.name, model, clips.actions.clone(), seed);
         header.frame_period = Some(clips.frame_period);

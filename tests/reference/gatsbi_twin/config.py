@@ -184,6 +184,7 @@ class TrackingConfig:
     ids: str
     """`monotone` or `original`."""
     scale_bounds: tuple[float, float] | None
+    merge: float | None
 
 
 @dataclass(frozen=True)

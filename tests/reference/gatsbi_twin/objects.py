@@ -16,6 +16,7 @@ from .memory import Memory, ObjectMemory
 from .noise import Noise
 from .propagation import Propagated, Propagation
 from .rendering import Rendering, render
+from .spatial import intersection_over_union
 from .surroundings import Agent, Surroundings
 
 
@@ -115,6 +116,8 @@ class ObjectModule(nn.Module):
         kept = order.argsort(dim=1, descending=True, stable=True)[:, : self.config.max_objects]
         is_new = kept < order.shape[1] - self.config.max_objects
         state = _number(_gather(candidates, kept), is_new, tracking)
+        if tracking.merge is not None:
+            _merge(state, tracking.merge)
         return state, ObjectStep(_gather_rows(proposal, kept), kl)
 
     def imagine(
@@ -214,6 +217,15 @@ def _number(state: ObjectState, is_new: Tensor, tracking: TrackingConfig) -> Obj
     state.ids = torch.where(is_new, counted - 1, state.ids)
     state.next_id = counted[:, -1]
     return state
+
+
+def _merge(state: ObjectState, threshold: float) -> None:
+    """Takes the presence from boxes that overlap a present one of a lower number by more than the threshold."""
+    presence, boxes = state.z[..., 0], state.z[..., 2:6].detach()
+    close = intersection_over_union(boxes, boxes) > threshold
+    older = state.ids[:, None, :] < state.ids[:, :, None]
+    same = (close & older & (presence > 0.5)[:, None, :]).any(-1)
+    state.z = torch.cat([torch.where(same, 0, presence).unsqueeze(-1), state.z[..., 1:]], -1)
 
 
 def _gather_rows(x: Tensor, kept: Tensor) -> Tensor:

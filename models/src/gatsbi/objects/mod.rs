@@ -31,7 +31,7 @@ use self::{
 use super::mixture::Memory;
 use crate::{
     config::{AgentFeature, DiscoveryPrior, GatsbiConfig, IdRule, Tracking},
-    nn::Path,
+    nn::{Path, spatial_transformer::iou},
     noise::{Noise, PhiloxNoise},
 };
 
@@ -208,6 +208,10 @@ impl ObjectModule {
             Some(candidates) => {
                 self.select(state, &tracked, &propagated, candidates, scenery, &discover, tracking)
             }
+        };
+        let next = match tracking.merge {
+            Some(threshold) => merged(next, threshold),
+            None => next,
         };
         (next, ObjectStep { proposal, propagated, discovered, discover })
     }
@@ -410,6 +414,18 @@ fn keep_present(
         next_id: state.next_id.shallow_clone(),
     };
     (next, pick(&propagated.proposal))
+}
+
+/// Takes the presence from boxes that overlap a present one of an earlier identity by more than `threshold`.
+fn merged(state: ObjectState, threshold: f64) -> ObjectState {
+    let boxes = place(&state.z).detach();
+    let overlap = iou(&boxes, &boxes).gt(threshold); // [B, MAX, MAX]
+    let earlier = state.ids.unsqueeze(1).less_tensor(&state.ids.unsqueeze(2)); // [b, i, j]: j is known longer than i
+    let present = presence(&state.z).gt(0.5).transpose(1, 2); // [B, 1, MAX]
+    let again = overlap.logical_and(&earlier).logical_and(&present).any_dim(-1, true);
+    let pres = presence(&state.z).masked_fill(&again, 0.0);
+    let rest = state.z.narrow(-1, 1, state.z.size()[2] - 1);
+    ObjectState { z: Tensor::cat(&[pres, rest], -1), ..state }
 }
 
 /// New objects are numbered in slot order from the session's counter.
