@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::variant::Variant;
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 7] = [
+const NAMED: [(&str, &str); 8] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -19,6 +19,7 @@ const NAMED: [(&str, &str); 7] = [
     ("balls", include_str!("../recipes/balls.toml")),
     ("tiny", include_str!("../recipes/tiny.toml")),
     ("tiny-refine", include_str!("../recipes/tiny-refine.toml")),
+    ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
 ];
 
 /// How a model is trained.
@@ -332,6 +333,6 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("roll, push1, push2, bair, balls, tiny, tiny-refine"), "{error}");
+        assert!(error.contains("roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects"), "{error}");
     }
 }
