@@ -11,7 +11,12 @@ use axum::{
 use parking_lot::RwLock;
 use tower::ServiceExt as _;
 
-use super::{Access, Pass, need::Need, tenants::Owner};
+use super::{
+    Access, Pass,
+    lease::{Lease, leased},
+    need::Need,
+    tenants::Owner,
+};
 use crate::{
     api::{call::TENANT, problem},
     error::Error,
@@ -80,29 +85,33 @@ impl Gate {
     }
 
     async fn answer(&self, mut request: Request) -> Response {
-        let router = match self.admit(&mut request) {
-            Ok(router) => router,
+        let (router, lease) = match self.admit(&mut request) {
+            Ok(admitted) => admitted,
             Err(error) => return refuse(&request, &error),
         };
         let response = router.oneshot(request).await;
         let mut response = response.unwrap_or_else(|never| match never {});
+        if let Some(lease) = lease {
+            response = leased(response, lease);
+        }
         harden(response.headers_mut());
         response
     }
 
-    /// The router that a request may use.
-    fn admit(&self, request: &mut Request) -> Result<Router, Error> {
+    /// The router that a request may use, and for how long if not for ever.
+    fn admit(&self, request: &mut Request) -> Result<(Router, Option<Lease>), Error> {
         let Some(access) = &self.access else {
-            return Ok(self.router("", &Owner::default()));
+            return Ok((self.router("", &Owner::default()), None));
         };
         let need = (self.need)(request.method(), request.uri());
-        let Some(Pass { tenant, owner }) = access.admit(bearer(request.headers()), need)? else {
-            return Ok(self.open.clone());
+        let Some(Pass { tenant, owner, lease }) = access.admit(bearer(request.headers()), need)?
+        else {
+            return Ok((self.open.clone(), None));
         };
         let name = HeaderValue::from_str(&tenant).expect("names of tenants fit into headers");
         request.headers_mut().insert(TENANT, name);
         request.headers_mut().remove(header::AUTHORIZATION);
-        Ok(self.router(&tenant, &owner))
+        Ok((self.router(&tenant, &owner), Some(lease)))
     }
 
     fn router(&self, tenant: &str, owner: &Owner) -> Router {

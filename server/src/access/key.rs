@@ -91,9 +91,8 @@ pub fn new_secret() -> String {
     format!("{PREFIX}{}", BASE64_URL_SAFE_NO_PAD.encode(rand::random::<[u8; 32]>()))
 }
 
-/// The entry of a key. Every entry is compared, each in a time that does not depend on where it differs.
-pub(super) fn find<'a>(entries: &'a [Entry], secret: &str) -> Option<&'a Entry> {
-    let digest = KeyDigest::of(secret);
+/// The entry of the key with a digest. Every entry is compared, each in a time that does not depend on where it differs.
+pub(super) fn find<'a>(entries: &'a [Entry], digest: &KeyDigest) -> Option<&'a Entry> {
     let mut found = None;
     for entry in entries {
         if bool::from(entry.digest.0.ct_eq(&digest.0)) {
@@ -134,8 +133,8 @@ mod tests {
             expires: None,
         };
         let entries = [entry(&other), entry(&secret)];
-        assert_eq!(find(&entries, &secret).unwrap().digest, digest);
-        assert!(find(&entries, &new_secret()).is_none());
+        assert_eq!(find(&entries, &KeyDigest::of(&secret)).unwrap().digest, digest);
+        assert!(find(&entries, &KeyDigest::of(&new_secret())).is_none());
         let shown = format!("{:?}", entries[1]);
         assert!(!shown.contains(&digest.to_string()[..8]), "{shown}");
     }

@@ -4,13 +4,14 @@
 //! ([`gate`]) stands before each listener's paths and looks at the headers of a request alone: which role the path
 //! needs ([`need`]), and whose key came along. It then hands the request to the tenant's own router, whose
 //! [`crate::service::Service`] sees what belongs to that tenant and nothing else ([`tenants`]), so no handler can
-//! forget to ask. Without a file of keys everybody may do everything, which is why the server then listens on the
+//! forget to ask. What is let in and goes on ends with its key ([`lease`]). Without a file of keys everybody may do everything, which is why the server then listens on the
 //! loopback.
 
 pub mod command;
 pub mod gate;
 pub mod key;
 pub mod key_file;
+pub mod lease;
 pub mod need;
 pub mod tenants;
 
@@ -22,9 +23,12 @@ use std::{
 };
 
 use parking_lot::RwLock;
+use tokio::sync::watch;
 
 use self::{
+    key::{KeyDigest, Role},
     key_file::{Entry, KeyFile, KeyFileError},
+    lease::Lease,
     need::Need,
     tenants::{Owner, Quota, Tenants},
 };
@@ -35,6 +39,7 @@ use crate::error::Error;
 pub struct Access {
     path: PathBuf,
     keys: RwLock<Arc<[Entry]>>,
+    changes: watch::Sender<()>,
     tenants: Tenants,
 }
 
@@ -45,6 +50,8 @@ pub struct Pass {
     pub tenant: String,
     /// What it owns and may take.
     pub owner: Owner,
+    /// For how long.
+    pub lease: Lease,
 }
 
 impl Access {
@@ -57,7 +64,8 @@ impl Access {
         let tenants = Tenants::default();
         tenants.set(&file.tenants(), &file.quotas, quota);
         tracing::info!(path = %path.display(), keys = file.keys.len(), "keys read");
-        Ok(Self { path: path.to_owned(), keys: RwLock::new(file.keys.into()), tenants })
+        let (keys, changes) = (RwLock::new(file.keys.into()), watch::Sender::new(()));
+        Ok(Self { path: path.to_owned(), keys, changes, tenants })
     }
 
     /// Reads the file again; from then on its keys and quotas are in force.
@@ -69,6 +77,7 @@ impl Access {
         self.tenants.set(&file.tenants(), &file.quotas, quota);
         let count = file.keys.len();
         *self.keys.write() = file.keys.into();
+        self.changes.send_replace(());
         Ok(count)
     }
 
@@ -76,21 +85,35 @@ impl Access {
     ///
     /// # Errors
     /// If there is no such key, it has expired, or its role is too low.
-    pub fn admit(&self, secret: Option<&str>, need: Need) -> Result<Option<Pass>, Error> {
+    pub fn admit(
+        self: &Arc<Self>,
+        secret: Option<&str>,
+        need: Need,
+    ) -> Result<Option<Pass>, Error> {
         let needs = match need {
             Need::Nothing => return Ok(None),
             Need::Role(role) => role,
         };
-        let secret = secret.ok_or(Error::NoKey)?;
+        let digest = KeyDigest::of(secret.ok_or(Error::NoKey)?);
+        // Before the keys are looked at, so that no change is missed.
+        let changes = self.changes.subscribe();
+        let Entry { tenant, .. } = self.entry(&digest, needs)?;
+        let owner = self.tenants.owner(&tenant);
+        let lease = Lease::new(self, (digest, needs), &tenant, changes);
+        Ok(Some(Pass { tenant, owner, lease }))
+    }
+
+    /// The key that has a digest, if it is good for something now.
+    fn entry(&self, digest: &KeyDigest, needs: Role) -> Result<Entry, Error> {
         let keys = Arc::clone(&self.keys.read());
-        let entry = key::find(&keys, secret).ok_or(Error::WrongKey)?;
+        let entry = key::find(&keys, digest).ok_or(Error::WrongKey)?;
         if entry.expires.is_some_and(|at| at <= SystemTime::now()) {
             return Err(Error::ExpiredKey);
         }
         if entry.role < needs {
             return Err(Error::RoleTooLow { role: entry.role.name(), needs: needs.name() });
         }
-        Ok(Some(Pass { tenant: entry.tenant.clone(), owner: self.tenants.owner(&entry.tenant) }))
+        Ok(entry.clone())
     }
 
     /// Tenants with what they have taken, by name.

@@ -211,6 +211,18 @@ impl KeyFile {
         secret
     }
 
+    /// Takes a key out.
+    pub(crate) fn revoke(&mut self, secret: &str) {
+        use std::io::Seek as _;
+        let digest = KeyDigest::of(secret).to_string();
+        let text = std::fs::read_to_string(self.0.path()).unwrap();
+        let entries = text.split("[[keys]]").filter(|entry| !entry.contains(&digest));
+        let left = entries.collect::<Vec<_>>().join("[[keys]]");
+        self.0.as_file().set_len(0).unwrap();
+        self.0.rewind().unwrap();
+        self.write(&left);
+    }
+
     pub(crate) fn write(&mut self, text: &str) {
         use std::io::Write as _;
         self.0.write_all(format!("\n{text}").as_bytes()).unwrap();

@@ -10,6 +10,7 @@ mod forks;
 mod handles;
 mod invariance;
 mod knock;
+mod leases;
 mod load;
 mod metrics;
 mod mixes;

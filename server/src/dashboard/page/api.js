@@ -24,13 +24,17 @@ function headers(more = {}) {
   return key.get() ? { ...more, authorization: `Bearer ${key.get()}` } : more;
 }
 
-async function answer(response) {
-  if (response.ok) return response;
-  const document = await response.json().catch(() => ({}));
-  if (response.status === 401 || response.status === 403) {
+/** What the server refuses; where a key is at fault, another one is asked for. */
+function refusal(status, document) {
+  if (status === 401 || status === 403) {
     events.dispatchEvent(new CustomEvent("key", { detail: document.detail }));
   }
-  throw new Problem(response.status, document);
+  return new Problem(status, document);
+}
+
+async function answer(response) {
+  if (response.ok) return response;
+  throw refusal(response.status, await response.json().catch(() => ({})));
 }
 
 async function send(path, options = {}) {
@@ -67,7 +71,7 @@ export async function* lines(path, options) {
   for await (const line of split(response.body, "\n")) {
     if (!line.trim()) continue;
     const value = JSON.parse(line);
-    if (value.problem) throw new Problem(value.problem.status ?? 0, value.problem);
+    if (value.problem) throw refusal(value.problem.status ?? 0, value.problem);
     yield value;
   }
 }
@@ -107,7 +111,10 @@ export async function follow(path, signal, heard, refused) {
         const field = (name) => event.split("\n").find((line) => line.startsWith(`${name}:`))?.slice(name.length + 1).trim();
         const name = field("event");
         if (!name) continue;
-        heard(name, JSON.parse(field("data")));
+        const data = JSON.parse(field("data"));
+        // The feed ends with its key.
+        if (name === "problem") throw refusal(data.status, data);
+        heard(name, data);
         if (name === "closed") return;
       }
     } catch (error) {
