@@ -15,6 +15,7 @@ pub mod config;
 pub mod dashboard;
 pub mod engine;
 pub mod error;
+pub mod frame;
 pub mod listener;
 pub mod logs;
 pub mod media;

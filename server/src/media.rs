@@ -18,7 +18,7 @@ use image::{
     codecs::png::{CompressionType, FilterType as PngFilter, PngEncoder},
 };
 
-use crate::{error::Error, tensor};
+use crate::{error::Error, frame::Frame, tensor};
 
 /// What pictures a model takes.
 #[derive(Clone, Copy, Debug)]
@@ -34,8 +34,8 @@ pub struct Target {
 /// A picture as a model takes it.
 #[derive(Clone, Debug)]
 pub struct Fitted {
-    /// Colours by row and column, `[3, H, W]` in [0, 1].
-    pub pixels: Arc<[f32]>,
+    /// What the model sees.
+    pub frame: Frame,
     /// Width and height of what was sent.
     pub sent: (u32, u32),
 }
@@ -104,7 +104,7 @@ fn encoded(bytes: &Bytes, field: &str, target: Target) -> Result<Fitted, Error> 
     reader.limits(limits);
     let image = reader.decode().map_err(broken)?.into_rgb8();
     let pixels: Vec<U8x3> = image.pixels().map(|pixel| U8x3::new(pixel.0)).collect();
-    Ok(fitted(&pixels, sent, target, |byte| f32::from(byte) / 255.0))
+    Ok(fitted(&pixels, sent, target))
 }
 
 fn raw(pixels: &v1::Tensor, field: &str, target: Target) -> Result<Fitted, Error> {
@@ -119,7 +119,7 @@ fn raw(pixels: &v1::Tensor, field: &str, target: Target) -> Result<Fitted, Error
             let bytes = tensor::bytes(pixels, field)?;
             let (colours, _) = bytes.as_chunks::<3>();
             let pixels: Vec<U8x3> = colours.iter().map(|colour| U8x3::new(*colour)).collect();
-            Ok(fitted(&pixels, sent, target, |byte| f32::from(byte) / 255.0))
+            Ok(fitted(&pixels, sent, target))
         }
         v1::DataType::F32 => {
             let numbers = tensor::floats(pixels, field)?;
@@ -129,8 +129,7 @@ fn raw(pixels: &v1::Tensor, field: &str, target: Target) -> Result<Fitted, Error
             }
             let (colours, _) = numbers.as_chunks::<3>();
             let pixels: Vec<F32x3> = colours.iter().map(|colour| F32x3::new(*colour)).collect();
-            // The filter's weights add up to one, but for rounding.
-            Ok(fitted(&pixels, sent, target, |number| number.clamp(0.0, 1.0)))
+            Ok(fitted(&pixels, sent, target))
         }
         _ => {
             let found = pixels.dtype().as_str_name();
@@ -151,37 +150,28 @@ fn check_size((width, height): (u32, u32), field: &str, target: Target) -> Resul
 
 /// A pixel of three colours.
 trait Colours: PixelTrait {
-    type Colour: Copy;
-
-    fn colours(self) -> [Self::Colour; 3];
+    /// Their frame, colours apart.
+    fn frame(pixels: &[Self]) -> Frame;
 }
 
 impl Colours for U8x3 {
-    type Colour = u8;
-
-    fn colours(self) -> [u8; 3] {
-        self.0
+    fn frame(pixels: &[Self]) -> Frame {
+        Frame::Bytes(apart(pixels, |pixel, colour| pixel.0[colour]))
     }
 }
 
 impl Colours for F32x3 {
-    type Colour = f32;
-
-    fn colours(self) -> [f32; 3] {
-        self.0
+    fn frame(pixels: &[Self]) -> Frame {
+        // The filter's weights add up to one, but for rounding.
+        Frame::Floats(apart(pixels, |pixel, colour| pixel.0[colour].clamp(0.0, 1.0)))
     }
 }
 
 /// Fits pixels to the model's size and brings their colours apart.
-fn fitted<P: Colours>(
-    pixels: &[P],
-    sent: (u32, u32),
-    target: Target,
-    number: impl Fn(P::Colour) -> f32,
-) -> Fitted {
+fn fitted<P: Colours>(pixels: &[P], sent: (u32, u32), target: Target) -> Fitted {
     let size = target.size;
     if sent == (size, size) {
-        return Fitted { pixels: apart(pixels, number), sent };
+        return Fitted { frame: P::frame(pixels), sent };
     }
     let cropped: Vec<P>;
     let (pixels, width, height) = match target.preprocess {
@@ -200,7 +190,7 @@ fn fitted<P: Colours>(
     Resizer::new()
         .resize_typed(&source, &mut fitted, &options)
         .expect("nothing is cropped, and neither size is zero");
-    Fitted { pixels: apart(fitted.pixels(), number), sent }
+    Fitted { frame: P::frame(fitted.pixels()), sent }
 }
 
 /// The largest centred square: its side, and where it begins from the left and from the top.
@@ -209,9 +199,10 @@ fn square((width, height): (u32, u32)) -> (u32, u32, u32) {
     (side, (width - side) / 2, (height - side) / 2)
 }
 
-fn apart<P: Colours>(pixels: &[P], number: impl Fn(P::Colour) -> f32) -> Arc<[f32]> {
-    let number = &number;
-    (0..3).flat_map(|c| pixels.iter().map(move |pixel| number(pixel.colours()[c]))).collect()
+/// All of the first colour, then of the second, then of the third.
+fn apart<P, C>(pixels: &[P], colour: impl Fn(&P, usize) -> C) -> Arc<[C]> {
+    let colour = &colour;
+    (0..3).flat_map(|c| pixels.iter().map(move |pixel| colour(pixel, c))).collect()
 }
 
 #[cfg(test)]
@@ -256,11 +247,12 @@ mod tests {
         let bytes = grid(4, 4);
         let raw = fit(&u8_image(4, 4, bytes.clone()), "image", TARGET).unwrap();
         let green = f32::from(bytes[5 * 3 + 1]) / 255.0;
-        assert_eq!(raw.pixels[16 + 5..][..1], [green], "green of pixel 5");
+        assert_eq!(raw.frame.floats()[16 + 5..][..1], [green], "green of pixel 5");
+        assert_eq!(raw.frame.bytes(), 48, "a byte is kept as a byte");
         let floats = bytes.iter().map(|byte| f32::from(*byte) / 255.0).collect();
         let file = v1::Image { content: Some(Content::Encoded(png(&bytes, (4, 4), 3))) };
         for same in [f32_image(4, 4, floats), file] {
-            assert_eq!(fit(&same, "image", TARGET).unwrap().pixels, raw.pixels);
+            assert_eq!(fit(&same, "image", TARGET).unwrap().frame.floats(), raw.frame.floats());
         }
     }
 
@@ -273,7 +265,7 @@ mod tests {
         for preprocess in [Preprocess::Stretch, Preprocess::CentreCrop] {
             let fitted = fit(&image, "image", Target { preprocess, ..TARGET }).unwrap();
             assert_eq!(fitted.sent, (64, 32));
-            let row = &fitted.pixels[..4];
+            let row = &fitted.frame.floats()[..4];
             assert_eq!((row[0], row[3]), (0.0, 1.0));
             // The filter reaches one model pixel to either side.
             assert!((0.05..0.2).contains(&row[1]) && (0.8..0.95).contains(&row[2]), "{row:?}");
@@ -284,7 +276,7 @@ mod tests {
             .collect();
         let target = Target { preprocess: Preprocess::CentreCrop, ..TARGET };
         let fitted = fit(&u8_image(48, 16, bytes), "image", target).unwrap();
-        assert!(fitted.pixels.iter().all(|x| *x == 0.0), "{:?}", fitted.pixels);
+        assert!(fitted.frame.floats().iter().all(|x| *x == 0.0), "{:?}", fitted.frame);
     }
 
     #[test]

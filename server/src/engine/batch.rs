@@ -23,11 +23,12 @@ use super::{
     commands::{Form, Imagine, NumberType, Observe, Spent, Value, Wanted},
     scheduler::RowStep,
 };
+use crate::frame::Frame;
 
 /// The rows of a block as a model takes them. Empty lanes hold copies of a taken one.
 pub(super) struct Batch {
     states: States,
-    frames: Option<Vec<Arc<[f32]>>>,
+    frames: Option<Vec<Frame>>,
     actions: Vec<f32>,
     noise: Vec<RowNoise>,
     wanted: Vec<Wanted>,
@@ -56,8 +57,7 @@ impl Batch {
     /// A batch of observes, all with an image or all without.
     pub(super) fn observe(lanes: &[Option<&Observe>]) -> Self {
         let padded = padded(lanes);
-        let frames: Option<Vec<Arc<[f32]>>> =
-            padded.iter().map(|observe| observe.frame.clone()).collect();
+        let frames = padded.iter().map(|observe| observe.frame.clone()).collect();
         Self {
             states: States::Host(padded.iter().map(|observe| Arc::clone(&observe.state)).collect()),
             frames,
@@ -180,7 +180,9 @@ fn step(world: &dyn WorldModel, batch: Batch) -> Computed {
     } else {
         let frame = batch.frames.map(|frames| {
             let size = world.spec().image_size;
-            tensor(&frames.concat()).view([lanes as i64, 3, size, size])
+            let mut numbers = Vec::with_capacity(lanes * 3 * (size * size) as usize);
+            frames.iter().for_each(|frame| frame.append_to(&mut numbers));
+            tensor(&numbers).view([lanes as i64, 3, size, size])
         });
         world.observe(&state, frame.as_ref(), &action, &noise, outputs)
     };

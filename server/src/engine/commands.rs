@@ -14,6 +14,7 @@ use gatsbi_models::{
 use tokio::sync::{mpsc, oneshot};
 
 use super::{door::Ticket, models::ModelEntry, models::Newcomer};
+use crate::frame::Frame;
 
 /// Whose work it is: rollouts are fair between tenants. A client may name itself; by default each session is one.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
@@ -95,8 +96,8 @@ pub struct Observe {
     pub model: Arc<ModelEntry>,
     /// The belief before.
     pub state: Arc<StateRow>,
-    /// Colours by row and column, `[3, H, W]` in [0, 1]; absent if no image came.
-    pub frame: Option<Arc<[f32]>>,
+    /// The image; absent if none came.
+    pub frame: Option<Frame>,
     /// The action that led to it, `[A]` in raw units.
     pub action: Vec<f32>,
     /// How the row draws.

@@ -9,7 +9,7 @@ use super::{
     canvas::{Canvas, sheet},
     colour_of, enlarge,
 };
-use crate::sessions::live::Shown;
+use crate::{frame::Frame, sessions::live::Shown};
 
 /// How strongly masks tint.
 const TINT: f32 = 0.5;
@@ -40,12 +40,16 @@ pub struct Scene {
     pub objects: Vec<(v1::Object, Vec<u8>)>,
 }
 
-/// Colours by row and column, `[3, size, size]`, as a picture.
-pub fn camera(colours: &[f32], size: u32) -> RgbImage {
+/// A frame of `[3, size, size]` as a picture.
+pub fn camera(frame: &Frame, size: u32) -> RgbImage {
+    let colours: Vec<u8> = match frame {
+        Frame::Bytes(bytes) => bytes.to_vec(),
+        Frame::Floats(floats) => floats.iter().copied().map(byte).collect(),
+    };
     let pixels = (size * size) as usize;
     RgbImage::from_fn(size, size, |x, y| {
         let at = (y * size + x) as usize;
-        Rgb([0, 1, 2].map(|channel| byte(colours[channel * pixels + at])))
+        Rgb([0, 1, 2].map(|channel| colours[channel * pixels + at]))
     })
 }
 
@@ -207,7 +211,11 @@ mod tests {
     fn what_the_camera_saw_is_painted_as_it_came() {
         // Colours by row and column: red, then green, then blue.
         let colours: Vec<f32> = (0..12).map(|i| i as f32 * 17.0 / 255.0).collect();
-        let picture = camera(&colours, 2);
+        let floats = Frame::Floats(colours.into());
+        let picture = camera(&floats, 2);
+        let bytes = Frame::Bytes((0..12).map(|i| i * 17).collect());
+        assert_eq!(camera(&bytes, 2), picture);
+        assert_eq!(bytes, Frame::Bytes(floats.floats().into_iter().map(byte).collect()));
         assert_eq!(picture.get_pixel(1, 0), &Rgb([17, 17 * 5, 17 * 9]));
         assert_eq!(picture.get_pixel(0, 1), &Rgb([34, 17 * 6, 17 * 10]));
     }

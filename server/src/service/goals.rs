@@ -74,7 +74,9 @@ impl Service {
             return Err(Error::invalid("image", "absent", "an image, masks, or both"));
         }
         let image = match request.image {
-            Some(image) => Some(colours_last(&self.fit(image, "image", &model).await?.pixels)),
+            Some(image) => {
+                Some(colours_last(&self.fit(image, "image", &model).await?.frame.floats()))
+            }
             None => None,
         };
         let mut masks = Masks::new();
@@ -200,7 +202,7 @@ impl Service {
                 values: Vec::new(),
             };
             let image = v1::Image { content: Some(Content::Pixels(pixels)) };
-            let fitted = self.fit(image, &field, model).await?.pixels;
+            let fitted = self.fit(image, &field, model).await?.frame.floats();
             masks.push((subject, fitted[..fitted.len() / 3].into()));
         }
         Ok(masks)

@@ -98,7 +98,7 @@ impl Service {
         };
         let decoding = began.elapsed();
         let image = fitted.as_ref().map_or(image, |fitted| fitted.sent);
-        let frame = fitted.map(|fitted| fitted.pixels);
+        let frame = fitted.map(|fitted| fitted.frame);
         let seen = Seen { step, frame: frame.clone(), action: action.clone(), image };
         let wanted = Wanted { spread: Self::besides(session, &model.spec), ..selection.wanted };
         let observed = self

@@ -9,6 +9,7 @@ use super::Service;
 use crate::{
     engine::commands::{Form, Observe, Urgency, Wanted},
     error::Error,
+    frame::Frame,
     sessions::session::{Draws, Position},
     tensor,
 };
@@ -96,7 +97,7 @@ impl Service {
                 None => position.model.spec.neutral_action(),
                 Some(at) => numbers[at * width..][..width].to_vec(),
             };
-            position = self.replayed(position, Some(fitted.pixels), action).await?;
+            position = self.replayed(position, Some(fitted.frame), action).await?;
             position.image = fitted.sent;
         }
         Ok(position)
@@ -106,7 +107,7 @@ impl Service {
     pub(super) async fn replayed(
         &self,
         position: Position,
-        frame: Option<Arc<[f32]>>,
+        frame: Option<Frame>,
         action: Vec<f32>,
     ) -> Result<Position, Error> {
         let Position { model, draws, next_step, state, image } = position;

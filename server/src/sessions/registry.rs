@@ -170,7 +170,7 @@ impl Room {
     }
 }
 
-/// The most that a session will keep of its past, in bytes.
+/// The most that a session will keep of its past, in bytes: frames may come as floats.
 pub fn kept_bytes(terms: &Terms, position: &Position) -> u64 {
     let spec = &position.model.spec;
     let frame = (3 * spec.image_size * spec.image_size) as u64 * 4 + spec.actions.len() as u64 * 4;

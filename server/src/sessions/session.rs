@@ -20,7 +20,7 @@ use super::{
     live::{Last, Live},
     registry::Room,
 };
-use crate::{access::tenants::Owner, engine::models::ModelEntry, error::Error};
+use crate::{access::tenants::Owner, engine::models::ModelEntry, error::Error, frame::Frame};
 
 /// 128 random bits, written as 32 hexadecimal digits.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
@@ -144,8 +144,8 @@ pub struct Answer {
 pub struct Seen {
     /// Its step.
     pub step: u64,
-    /// Colours by row and column, `[3, H, W]` in [0, 1]; absent for a dropped frame.
-    pub frame: Option<Arc<[f32]>>,
+    /// Its image; absent for a dropped frame.
+    pub frame: Option<Frame>,
     /// The action that led to it, in raw units.
     pub action: Vec<f32>,
     /// Width and height of the last image that came.
@@ -356,7 +356,7 @@ impl History {
 
 impl Seen {
     fn bytes(&self) -> usize {
-        (self.frame.as_ref().map_or(0, |frame| frame.len()) + self.action.len()) * 4
+        self.frame.as_ref().map_or(0, Frame::bytes) + size_of_val(&*self.action)
     }
 }
 
@@ -410,7 +410,7 @@ pub(super) mod tests {
     fn absorb(session: &Session, last: u64) {
         for step in session.position().next_step..=last {
             let belief = v1::Belief { step, ..Default::default() };
-            let frame = (step != 6).then(|| Arc::from([0.5f32; 12]));
+            let frame = (step != 6).then(|| Frame::Bytes([128; 12].into()));
             let seen = Seen { step, frame, action: vec![step as f32], image: (4, 3) };
             session.commit(at(step + 1), Answer { digest: [0; 32], belief }, seen);
         }
@@ -427,7 +427,7 @@ pub(super) mod tests {
         absorb(&session, 9);
         assert_eq!(
             (session.oldest_step(), session.bytes()),
-            (Some(6), 4 * 32 + 4 * 4 + 3 * 48 + 2)
+            (Some(6), 4 * 32 + 4 * 4 + 3 * 12 + 2)
         );
         assert_eq!(seen(&session), [7, 8, 9], "6 came without an image");
         let refused = Error::StepNotKept { to_step: 5, oldest: Some(6), last: 9 };

@@ -1,6 +1,7 @@
 //! Models and sessions: what is there, opened, listed and closed, the same on both APIs.
 
 use gatsbi_proto::v1;
+use prost::Message as _;
 use serde_json::json;
 use tonic::Code;
 use tonic_reflection::pb::v1::{
@@ -8,7 +9,7 @@ use tonic_reflection::pb::v1::{
     server_reflection_request::MessageRequest, server_reflection_response::MessageResponse,
 };
 
-use crate::support::{TestServer, config, observation, serving_both};
+use crate::support::{ACTION, TestServer, config, observation, outputs, serving_both};
 
 #[tokio::test]
 async fn models_are_described_on_both_apis() {
@@ -65,6 +66,27 @@ async fn a_session_is_one_and_the_same_on_both_apis() {
     assert_eq!(gone.code(), Code::NotFound);
     let gone = server.observe(observation(&session, 0)).await.unwrap_err();
     assert_eq!(gone.code(), Code::NotFound);
+    server.app.shutdown().await;
+}
+
+#[tokio::test]
+async fn an_idle_session_is_two_beliefs_and_the_frame_between() {
+    let server = TestServer::start().await;
+    let session = server.session(1).await;
+    let selection = outputs(&[v1::Output::Objects], v1::Encoding::U8);
+    let request = |step| v1::ObserveRequest {
+        outputs: Some(selection.clone()),
+        ..observation(&session, step)
+    };
+    let mut answer = 0;
+    for step in 0..3 {
+        answer = server.observe(request(step)).await.unwrap().encoded_len();
+    }
+    let told = v1::GetSessionRequest { session_id: session.id.clone() };
+    let told = server.sessions.clone().get_session(told).await.unwrap().into_inner();
+    let bytes = told.session.unwrap().bytes as usize;
+    assert!(bytes.abs_diff(2 * 16_816 + 64 * 64 * 3 + ACTION * 4 + answer) < 16, "{bytes}");
+    assert!(bytes <= 65_536);
     server.app.shutdown().await;
 }
 
