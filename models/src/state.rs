@@ -37,6 +37,12 @@ pub struct StateLayout {
     fields: Vec<Field>,
 }
 
+impl FromIterator<Field> for StateLayout {
+    fn from_iter<F: IntoIterator<Item = Field>>(fields: F) -> Self {
+        Self { fields: fields.into_iter().collect() }
+    }
+}
+
 impl StateLayout {
     /// The fields in order.
     pub fn fields(&self) -> &[Field] {

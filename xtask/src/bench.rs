@@ -1,25 +1,33 @@
-//! Time of the Rust model's steps beside its twin in PyTorch: same weights, one thread each, in turns.
+//! What the service takes, beside what else could be used.
 //!
-//! What counts is processor time, which leaves out the time in which others had the core. Others still slow memory and
+//! First, steps of the Rust model beside its twin in PyTorch: same weights, one thread each, in turns. What counts is processor time, which leaves out the time in which others had the core. Others still slow memory and
 //! caches down, so the sides take turns at every step in every round, and the result is the median over the rounds of the
-//! ratio within a round. The twin runs eagerly, in both memory formats, and the faster one counts. What a step is, is
-//! said in `models/examples/timing.rs` and `tests/reference/gatsbi_twin/timing.py`.
-//! `figures` has the names and the sums of what is reported; `docs/performance.md` says what was learned from it.
+//! ratio within a round. The twin runs eagerly, in both memory formats, and the faster one counts; and for 64 imagined rows
+//! under `torch.compile` too. What a step is, is said in `tests/load/engine/steps.rs` and
+//! `tests/reference/gatsbi_twin/timing.py`.
+//!
+//! Then [`service`]: what sessions, batching and connections cost. [`peers`] puts other servers beside ours. `figures` has
+//! the names and the sums of what is reported; `docs/performance.md` says what was learned from it.
 
 mod figures;
+mod peers;
+mod service;
+mod side;
 
+use std::collections::BTreeMap;
 use std::fmt;
-use std::io::{BufRead as _, BufReader, IsTerminal as _, Write as _, stderr};
+use std::io::{IsTerminal as _, Write as _, stderr};
 use std::path::{Path, PathBuf};
-use std::process::{ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::Result;
 use clap::Args;
 use fs_err as fs;
 use serde_json::{Value, json};
 
-use crate::cargo;
+use self::side::Side;
+use crate::cargo::{self, Programs};
 use crate::libtorch::VERSION;
 use crate::process::{Interrupt, Running};
 use crate::{setup, twin};
@@ -48,17 +56,34 @@ pub(crate) struct Arguments {
     /// Rounds
     #[arg(long, value_name = "N", default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..))]
     rounds: u32,
+    /// Measure only the steps of the model, only the service, or only the service beside other servers; by default the first two
+    #[arg(long, value_enum)]
+    only: Option<Part>,
+    /// Measure the service beside Triton, mosec and LitServe with the twin behind them: the same as --only peers
+    ///
+    /// Makes .venv-peers with them from where pip is set to find them, unless it is there.
+    #[arg(long, conflicts_with = "only")]
+    peers: bool,
     /// Measure the dev profile, in which only the model is optimised: spares compiling libtorch's bindings once more
     #[arg(long)]
     dev: bool,
 }
 
-/// A program that makes steps when it is told to.
-struct Side {
-    name: &'static str,
-    input: ChildStdin,
-    output: BufReader<ChildStdout>,
-    program: Running,
+#[derive(Clone, Copy, PartialEq, clap::ValueEnum)]
+enum Part {
+    Steps,
+    Service,
+    Peers,
+}
+
+/// What is measured with.
+struct Tools<'a> {
+    root: &'a Path,
+    programs: Programs,
+    python: PathBuf,
+    /// Holds an untrained checkpoint of each preset.
+    folder: tempfile::TempDir,
+    interrupt: Interrupt,
 }
 
 /// One step of one model with one size of batch.
@@ -75,6 +100,8 @@ struct Round {
     rust: f64,
     /// In each of [`FORMATS`].
     twin: [f64; 2],
+    /// Under `torch.compile`, where that is measured.
+    compiled: Option<f64>,
     /// Measured beside 64 imagined rows.
     beside: Option<Beside>,
 }
@@ -92,89 +119,47 @@ struct Beside {
     state: f64,
 }
 
-/// What a program answered.
-struct Measured {
-    /// Processor time of a step.
-    seconds: f64,
-    /// What the answer says besides how many steps were made.
-    said: Vec<f64>,
-}
-
-/// Measures, prints a table, writes the file.
+/// Measures, prints tables, writes the file.
 pub(crate) fn bench(root: &Path, arguments: &Arguments) -> Result<()> {
     setup::ensure_set_up(root)?;
     let python = twin::python(root)?;
-    let trainer = cargo::build(root, "build --workspace --locked --bin gatsbi-train")?;
-    let timing = cargo::build(
+    let profile = if arguments.dev { "" } else { "--release " };
+    let programs = cargo::build(
         root,
-        if arguments.dev {
-            "build --workspace --locked --example timing"
-        } else {
-            "build --release --locked --package gatsbi-models --example timing"
-        },
+        &format!(
+            "build {profile}--workspace --locked --bin gatsbi-server --bin gatsbi-train \
+             --bin gatsbi-load --bin gatsbi-load-engine"
+        ),
     )?;
-    let interrupt = Interrupt::watch()?;
-
     let folder = tempfile::tempdir()?;
-    let file = |preset: &str| folder.path().join(preset);
+    let tools = Tools { root, programs, python, folder, interrupt: Interrupt::watch()? };
     for preset in PRESETS {
-        let mut init = Command::new(trainer.named("gatsbi-train")?);
-        init.args(["init", "--preset", preset, "--seed", "1", "--out"]).arg(file(preset));
-        Running::start(init.stdout(Stdio::null()), GRACE)?.wait(&interrupt)?;
+        let mut init = Command::new(tools.programs.named("gatsbi-train")?);
+        init.args(["init", "--preset", preset, "--seed", "1", "--out"]);
+        init.arg(tools.checkpoint(preset)).stdout(Stdio::null());
+        Running::start(&mut init, GRACE)?.wait(&tools.interrupt)?;
     }
-    let mut rust = Side::start("the Rust model", &mut Command::new(timing.named("timing")?))?;
-    let twin = || {
-        let mut command = Command::new(&python);
-        command.args(["-m", "gatsbi_twin.timing"]);
-        command
-    };
-    let mut channels_last = Side::start("the twin", &mut twin())?;
-    let mut contiguous = Side::start("the twin", twin().arg("--contiguous"))?;
-
-    let rounds = arguments.rounds;
-    let (seconds, batches) =
-        if arguments.quick { (0.1, &BATCHES[..2]) } else { (0.5, &BATCHES[..]) };
-    let mut lines = lines(batches);
-    for round in 0..=rounds {
-        for line in &mut lines {
-            interrupt.check()?;
-            progress(&format!("round {round} of {rounds}: {line}"));
-            let Line { batch, step, .. } = *line;
-            let time = if round == 0 { 0.0 } else { seconds };
-            let request = format!("{} {batch} {step} {time}", file(line.preset).display());
-            let ours = rust.measure(&request)?;
-            let beside = if batch == 64 && step == "imagine" {
-                let mut also = |batch: usize, step: &str| {
-                    rust.measure(&format!("{} {batch} {step} {time}", file(line.preset).display()))
-                };
-                let (many, multiply) = (also(MANY, "imagine")?, also(1, "multiply")?);
-                Some(Beside {
-                    many: many.seconds,
-                    multiply: multiply.said[0] / multiply.seconds,
-                    macs: ours.said[0],
-                    state: ours.said[1],
-                })
-            } else {
-                None
-            };
-            let twin = [channels_last.measure(&request)?, contiguous.measure(&request)?];
-            let twin = twin.map(|twin| twin.seconds);
-            let measured = Round { rust: ours.seconds, twin, beside };
-            // The first has loaded the model and made the batch.
-            line.rounds.extend((round > 0).then_some(measured));
-        }
+    let only = if arguments.peers { Some(Part::Peers) } else { arguments.only };
+    let (mut figures, mut lines) = (BTreeMap::new(), Vec::new());
+    if only.is_none_or(|only| only == Part::Steps) {
+        lines = steps(&tools, arguments)?;
+        print(&lines, arguments.rounds);
+        figures.extend(figures::figures(&lines));
     }
-    progress("");
-    print(&lines, rounds);
-    let figures = figures::figures(&lines);
+    if only.is_none_or(|only| only == Part::Service) {
+        figures.extend(service::measure(&tools, arguments)?);
+    }
+    if only == Some(Part::Peers) {
+        figures.extend(peers::measure(&tools, arguments)?);
+    }
     figures::print(&figures);
     if let Some(path) = &arguments.json {
         let lines: Vec<_> = lines.iter().map(Line::record).collect();
         let record = json!({
             "torch": VERSION,
-            "threads": 1,
             "processor": processor(),
             "profile": if arguments.dev { "dev" } else { "release" },
+            "load": fs::read_to_string("/proc/loadavg")?.trim(),
             "figures": figures,
             "steps": lines,
         });
@@ -183,38 +168,60 @@ pub(crate) fn bench(root: &Path, arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-impl Side {
-    fn start(name: &'static str, command: &mut Command) -> Result<Self> {
-        command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        let mut program = Running::start(command, GRACE)?;
-        let input = program.child.stdin.take().context("no standard input")?;
-        let output = program.child.stdout.take().context("no standard output")?;
-        Ok(Self { name, input, output: BufReader::new(output), program })
-    }
+/// Steps of the model and its twins, on one thread each, in turns.
+fn steps(tools: &Tools<'_>, arguments: &Arguments) -> Result<Vec<Line>> {
+    let mut engine = Command::new(tools.programs.named("gatsbi-load-engine")?);
+    let mut rust = Side::start("the Rust model", engine.arg("steps"))?;
+    let twin = |flags: &[&str]| {
+        let mut command = Command::new(&tools.python);
+        command.args(["-m", "gatsbi_twin.timing"]).args(flags);
+        Side::start("the twin", &mut command)
+    };
+    let mut channels_last = twin(&[])?;
+    let mut contiguous = twin(&["--contiguous"])?;
+    let mut compiled = twin(&["--compile"])?;
 
-    /// Processor time of a step in seconds, as a mean over those that it can make in its turn.
-    fn measure(&mut self, request: &str) -> Result<Measured> {
-        let before = self.processor_time()?;
-        let mut answer = String::new();
-        writeln!(self.input, "{request}")
-            .and_then(|()| self.output.read_line(&mut answer))
-            .with_context(|| format!("{} does not answer", self.name))?;
-        ensure!(!answer.is_empty(), "{} ended", self.name);
-        let numbers = answer.split_whitespace().map(str::parse).collect::<Result<Vec<f64>, _>>();
-        let numbers = numbers.with_context(|| format!("{} answered {answer:?}", self.name))?;
-        let (made, said) = numbers.split_first().context("an answer begins with a number")?;
-        Ok(Measured { seconds: (self.processor_time()? - before) / made, said: said.to_vec() })
-    }
-
-    /// What its threads have used so far, in seconds.
-    fn processor_time(&self) -> Result<f64> {
-        let mut nanoseconds = 0;
-        for thread in fs::read_dir(format!("/proc/{}/task", self.program.child.id()))? {
-            let times = fs::read_to_string(thread?.path().join("schedstat"))?;
-            let used = times.split(' ').next().and_then(|used| used.parse::<u64>().ok());
-            nanoseconds += used.with_context(|| format!("{times:?} is no schedstat"))?;
+    let rounds = arguments.rounds;
+    let (seconds, batches) =
+        if arguments.quick { (0.1, &BATCHES[..2]) } else { (0.5, &BATCHES[..]) };
+    let mut lines = lines(batches);
+    for round in 0..=rounds {
+        for line in &mut lines {
+            tools.interrupt.check()?;
+            progress(&format!("round {round} of {rounds}: {line}"));
+            let Line { batch, step, .. } = *line;
+            let time = if round == 0 { 0.0 } else { seconds };
+            let file = tools.checkpoint(line.preset);
+            let request = format!("{} {batch} {step} {time}", file.display());
+            let ours = rust.measure(&request)?;
+            let (mut beside, mut compiling) = (None, None);
+            if batch == 64 && step == "imagine" {
+                let mut also = |batch: usize, step: &str| {
+                    rust.measure(&format!("{} {batch} {step} {time}", file.display()))
+                };
+                let (many, multiply) = (also(MANY, "imagine")?, also(1, "multiply")?);
+                beside = Some(Beside {
+                    many: many.seconds,
+                    multiply: multiply.said[0] / multiply.seconds,
+                    macs: ours.said[0],
+                    state: ours.said[1],
+                });
+                compiling = Some(compiled.measure(&request)?.seconds);
+            }
+            let twin = [channels_last.measure(&request)?, contiguous.measure(&request)?];
+            let twin = twin.map(|twin| twin.seconds);
+            let measured = Round { rust: ours.seconds, twin, compiled: compiling, beside };
+            // The first has loaded the model and made the batch.
+            line.rounds.extend((round > 0).then_some(measured));
         }
-        Ok(Duration::from_nanos(nanoseconds).as_secs_f64())
+    }
+    progress("");
+    Ok(lines)
+}
+
+impl Tools<'_> {
+    fn checkpoint(&self, preset: &str) -> PathBuf {
+        self.folder.path().join(preset)
     }
 }
 
@@ -259,6 +266,7 @@ impl Line {
             "rust_seconds": all(&|round| round.rust),
             "twin_channels_last_seconds": all(&|round| round.twin[0]),
             "twin_contiguous_seconds": all(&|round| round.twin[1]),
+            "twin_compiled_seconds": self.rounds.iter().map(|round| round.compiled).collect::<Vec<_>>(),
             "twin_format": FORMATS[self.format()],
             "ratio_quartiles": self.ratio(),
         })
@@ -312,6 +320,12 @@ fn progress(what: &str) {
     }
 }
 
+/// The middle one of some numbers.
+fn median(mut numbers: Vec<f64>) -> f64 {
+    numbers.sort_by(f64::total_cmp);
+    numbers[(numbers.len() - 1) / 2]
+}
+
 fn processor() -> String {
     let described = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = described.lines().find_map(|line| line.strip_prefix("model name"));
@@ -328,7 +342,7 @@ mod tests {
         let mut line = lines(&[1]).remove(0);
         let round = |noise: f64| {
             let twin = [7.0 * noise, 5.0 * noise];
-            Round { rust: 2.0 * noise, twin, beside: None }
+            Round { rust: 2.0 * noise, twin, compiled: None, beside: None }
         };
         line.rounds = [1.0, 3.0, 1.5].map(round).into();
         assert_eq!(FORMATS[line.format()], "contiguous");

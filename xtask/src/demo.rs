@@ -4,30 +4,24 @@
 //! cleared away afterwards.
 
 use std::env;
-use std::io::{BufRead as _, BufReader};
-use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{ChildStdout, Command, Stdio};
-use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::thread;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, bail, ensure};
+use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use fs_err as fs;
 
 use crate::cargo;
 use crate::process::{Interrupt, Running};
+use crate::server::Server;
 use crate::setup;
 
 const SAMPLES: &str = "episodes/samples/push1-heldout.parquet";
 const BUNDLED: &str = "models/checkpoints";
 
-/// Longer than the server gives its requests to finish.
+/// For the demonstration to end in.
 const GRACE: Duration = Duration::from_secs(30);
-
-/// Lines of the server's log that are shown when it does not start.
-const LAST_LINES: usize = 20;
 
 #[derive(Args)]
 pub(crate) struct Arguments {
@@ -46,14 +40,6 @@ pub(crate) struct Arguments {
     /// Folder for pictures and the server's log; by default demo-out
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-}
-
-/// A running server.
-struct Server {
-    process: Running,
-    grpc: String,
-    http: String,
-    admin: String,
 }
 
 /// Shows the whole service on one episode.
@@ -78,14 +64,16 @@ pub(crate) fn demo(root: &Path, arguments: &Arguments) -> Result<()> {
             None => untrained(programs.named("gatsbi-train")?, &out)?,
         };
     let log = out.join("server.log");
-    let server = Server::start(programs.named("gatsbi-server")?, &checkpoint, &log, &interrupt)?;
+    let mut command = Command::new(programs.named("gatsbi-server")?);
+    command.arg("--checkpoint").arg(&checkpoint);
+    let server = Server::start(&mut command, &log, &interrupt)?;
     let episodes = arguments.episodes.clone().unwrap_or_else(|| short(&root.join(SAMPLES)));
     let mut client = Command::new(programs.named("gatsbi")?);
     client.args(["demo", "--server", &server.grpc, "--index", &arguments.index.to_string()]);
     client.arg("--episodes").arg(&episodes).arg("--out").arg(&out);
     let shown = Running::start(&mut client, GRACE)?.wait(&interrupt);
     if arguments.keep && shown.is_ok() {
-        server.keep(&short(programs.named("gatsbi")?), &log);
+        keep(server, &short(programs.named("gatsbi")?), &log);
         return Ok(());
     }
     let stopped = server.process.stop();
@@ -115,65 +103,16 @@ fn untrained(trainer: &Path, out: &Path) -> Result<PathBuf> {
     Ok(checkpoint)
 }
 
-impl Server {
-    /// Starts a server on free ports of the loopback and waits until it serves.
-    fn start(program: &Path, checkpoint: &Path, log: &Path, interrupt: &Interrupt) -> Result<Self> {
-        let any = "127.0.0.1:0";
-        let mut command = Command::new(program);
-        command.args(["--grpc-listen", any, "--http-listen", any, "--admin-listen", any]);
-        command.arg("--checkpoint").arg(checkpoint);
-        command
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .stderr(fs::File::create(log)?.into_file());
-        // Not in the terminal's group: Ctrl-C reaches this program, which then ends the server in order.
-        command.process_group(0);
-        let mut process = Running::start(&mut command, GRACE)?;
-        let stdout = process.child.stdout.take().context("the server has no standard output")?;
-        let line = first_line(stdout, interrupt)?;
-        let address = |name: &str| {
-            let mut words = line.split_whitespace();
-            words.find_map(|word| Some(format!("http://{}", word.strip_prefix(name)?)))
-        };
-        let (Some(grpc), Some(http), Some(admin)) =
-            (address("grpc="), address("http="), address("admin="))
-        else {
-            let text = fs::read_to_string(log).unwrap_or_default();
-            let from = text.lines().count().saturating_sub(LAST_LINES);
-            let last: Vec<_> = text.lines().skip(from).collect();
-            bail!("the server did not start; the end of {}:\n{}", log.display(), last.join("\n"));
-        };
-        Ok(Self { process, grpc, http, admin })
-    }
-
-    fn keep(self, client: &Path, log: &Path) {
-        let Self { process, grpc, http, admin } = self;
-        let id = process.leave();
-        eprintln!(
-            "\nthe server goes on (its log is {})\n  gRPC   {grpc}\n         {} models --server {grpc}\n  \
-             REST   {http}\n         curl {http}/v1/models\n  admin  {admin}/metrics\n  stop   kill {id}",
-            log.display(),
-            client.display(),
-        );
-    }
-}
-
-/// The first line that a program writes; empty if it ends without one.
-fn first_line(stdout: ChildStdout, interrupt: &Interrupt) -> Result<String> {
-    let (sender, receiver) = channel();
-    thread::Builder::new().name("server-output".to_owned()).spawn(move || {
-        let mut line = String::new();
-        let read = BufReader::new(stdout).read_line(&mut line);
-        // Nobody listens any more after an interrupt.
-        let _ = sender.send(read.map(|_| line));
-    })?;
-    loop {
-        match receiver.recv_timeout(Duration::from_millis(50)) {
-            Ok(line) => return Ok(line?),
-            Err(RecvTimeoutError::Timeout) => interrupt.check()?,
-            Err(RecvTimeoutError::Disconnected) => bail!("the server's output was not read"),
-        }
-    }
+/// Leaves a server running, and says where it is.
+fn keep(server: Server, client: &Path, log: &Path) {
+    let Server { process, grpc, http, admin } = server;
+    let id = process.leave();
+    eprintln!(
+        "\nthe server goes on (its log is {})\n  gRPC   {grpc}\n         {} models --server {grpc}\n  \
+         REST   {http}\n         curl {http}/v1/models\n  admin  {admin}/metrics\n  stop   kill {id}",
+        log.display(),
+        client.display(),
+    );
 }
 
 /// A path as one would type it here.

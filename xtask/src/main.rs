@@ -15,6 +15,7 @@ mod metrics;
 mod mujoco;
 mod package;
 mod process;
+mod server;
 mod setup;
 mod twin;
 

@@ -54,6 +54,11 @@ const ROOMS: &[Room] = &[
         ],
         must_not_hold: &[],
     },
+    Room {
+        package: "gatsbi-load",
+        may_name: &[MODELS, "gatsbi-client", "gatsbi-proto", "gatsbi-server"],
+        must_not_hold: &[],
+    },
     Room { package: "xtask", may_name: &[], must_not_hold: &[] },
 ];
 

@@ -1,21 +1,18 @@
-//! Steps of a frozen model on one thread: this crate's side in `cargo xtask bench`.
+//! Steps of a frozen model on one thread, beside its twin's (`tests/reference/gatsbi_twin/timing.py`).
 //!
-//! It takes turns with the model's twin (`tests/reference/gatsbi_twin/timing.py`), so it works only when it is told to:
-//! each line `CHECKPOINT BATCH STEP SECONDS` on standard input has a step (`observe` or `imagine`) repeated for so long,
-//! at least once, and is answered by how often it was made, the multiply-accumulates of one, and the bytes of a row's
-//! state; whoever asks looks at the processor time meanwhile. Steps are those that a server makes: packed state, actions
-//! in raw units, counter-based noise, new objects looked for in every frame, nothing drawn. The step `multiply` is a
-//! product of square matrices, as fast as libtorch makes one: what the processor can do.
-
-#![expect(clippy::print_stdout, reason = "answers go to standard output")]
+//! Each line `CHECKPOINT BATCH STEP SECONDS` has a step (`observe` or `imagine`) repeated for so long, at least once, and
+//! is answered by how often it was made, the multiply-accumulates of one, and the bytes of a row's state; whoever asks
+//! looks at the processor time meanwhile. Steps are those that a server makes: packed state, actions in raw units,
+//! counter-based noise, new objects looked for in every frame, nothing drawn. The step `multiply` is a product of square
+//! matrices, as fast as libtorch makes one: what the processor can do.
 
 use std::{
-    collections::HashMap,
-    error::Error,
+    collections::{HashMap, hash_map::Entry},
     path::Path,
     time::{Duration, Instant},
 };
 
+use anyhow::{Result, bail};
 use gatsbi_models::{
     gatsbi::world::GatsbiWorld,
     nn::count_macs,
@@ -29,6 +26,12 @@ use tch::{Device, Kind, Tensor};
 /// Rows of the matrices that are multiplied: large enough for full speed, small enough for a turn.
 const SIDE: u64 = 1024;
 
+/// Batches that have been asked for, by checkpoint and rows.
+pub(crate) struct Steps {
+    batches: HashMap<(String, i64), Batch>,
+    square: Tensor,
+}
+
 /// A batch of a model in the midst of its scenes.
 struct Batch {
     world: GatsbiWorld,
@@ -38,40 +41,41 @@ struct Batch {
     noise: PhiloxNoise,
 }
 
-fn main() -> Result<(), Box<dyn Error>> {
-    tch::set_num_threads(1);
-    tch::set_num_interop_threads(1);
-    let mut batches = HashMap::new();
-    let square = Tensor::rand([SIDE as i64; 2], (Kind::Float, Device::Cpu));
-    for line in std::io::stdin().lines() {
-        let line = line?;
+impl Steps {
+    pub(crate) fn new() -> Self {
+        tch::set_num_threads(1);
+        tch::set_num_interop_threads(1);
+        let square = Tensor::rand([SIDE as i64; 2], (Kind::Float, Device::Cpu));
+        Self { batches: HashMap::new(), square }
+    }
+
+    /// Measures what a line asks for; returns its numbers.
+    pub(crate) fn measure(&mut self, line: &str) -> Result<String> {
         let &[checkpoint, rows, step, seconds] = &line.split(' ').collect::<Vec<_>>()[..] else {
-            return Err(format!("{line:?} is not CHECKPOINT BATCH STEP SECONDS").into());
+            bail!("{line:?} is not CHECKPOINT BATCH STEP SECONDS");
         };
         let rows: i64 = rows.parse()?;
-        let key = (checkpoint.to_owned(), rows);
-        if !batches.contains_key(&key) {
-            batches.insert(key.clone(), Batch::new(Path::new(checkpoint), rows)?);
-        }
-        let batch = &batches[&key];
+        let batch = match self.batches.entry((checkpoint.to_owned(), rows)) {
+            Entry::Occupied(there) => there.into_mut(),
+            Entry::Vacant(new) => new.insert(Batch::new(Path::new(checkpoint), rows)?),
+        };
         let time = Duration::from_secs_f64(seconds.parse()?);
         let (made, macs) = match step {
             "observe" => repeat(time, || batch.observe()),
             "imagine" => repeat(time, || batch.imagine()),
             "multiply" => {
-                let (made, _) = repeat(time, || square.matmul(&square));
+                let (made, _) = repeat(time, || self.square.matmul(&self.square));
                 (made, SIDE.pow(3))
             }
-            _ => return Err(format!("{step:?} is not observe, imagine or multiply").into()),
+            _ => bail!("{step:?} is not observe, imagine or multiply"),
         };
-        println!("{made} {macs} {}", batch.world.layout().row_bytes());
+        Ok(format!("{made} {macs} {}", batch.world.layout().row_bytes()))
     }
-    Ok(())
 }
 
 impl Batch {
     /// A batch that has observed one frame and, to be warm, imagined one step.
-    fn new(checkpoint: &Path, rows: i64) -> Result<Self, Box<dyn Error>> {
+    fn new(checkpoint: &Path, rows: i64) -> Result<Self> {
         let device = Device::Cpu;
         let world = GatsbiWorld::load(checkpoint, device)?;
         let spec = world.spec();

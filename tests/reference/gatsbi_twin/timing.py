@@ -1,11 +1,11 @@
 """Steps of the twin on one thread: its side in `cargo xtask bench`.
 
-It takes turns with the Rust model (`models/examples/timing.rs`), so it works only when it is told to: each line
+It takes turns with the Rust model (`tests/load/engine/steps.rs`), so it works only when it is told to: each line
 `CHECKPOINT BATCH STEP SECONDS` on standard input has a step (`observe` or `imagine`) repeated for so long, at least
 once, and is answered by how often it was made; whoever asks looks at the processor time meanwhile. Steps are made as
 in serving: evaluation mode, no gradients, no priors, new objects looked for in every frame, nothing drawn; noise is
 drawn beforehand. Weights and images are channels-last unless `--contiguous`. Nothing is folded, fused or precomputed:
-this is the model as one would write it in PyTorch.
+this is the model as one would write it in PyTorch. With `--compile` imagined steps go through `torch.compile`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from . import checkpoint, noise
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--contiguous", action="store_true", help="weights and images channel by channel")
-    contiguous: bool = parser.parse_args().contiguous
+    parser.add_argument("--compile", action="store_true", help="imagined steps under torch.compile")
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_num_interop_threads(1)
     for line in sys.stdin:
         path, batch, step, seconds = line.split()
-        job = batch_of(Path(path), int(batch), contiguous)[step]
+        job = batch_of(Path(path), int(batch), arguments.contiguous, arguments.compile)[step]
         print(repeat(job, float(seconds)), flush=True)
 
 
 @cache
 @torch.inference_mode()
-def batch_of(path: Path, batch: int, contiguous: bool) -> dict[str, Callable[[], object]]:
+def batch_of(path: Path, batch: int, contiguous: bool, compiled: bool) -> dict[str, Callable[[], object]]:
     """The steps of a batch that has observed one frame and, to be warm, imagined one step."""
     memory_format = torch.contiguous_format if contiguous else torch.channels_last
     model = checkpoint.load(path).model.to(memory_format=memory_format)
@@ -46,10 +47,11 @@ def batch_of(path: Path, batch: int, contiguous: bool) -> dict[str, Callable[[],
     action = torch.randn(batch, config.action.dim, generator=generator)
     draws = noise.sample(config, batch, generator)
     state, _ = model.observe(model.initial_state(batch), frame, action, draws)
-    model.imagine(state, action, draws)
+    imagine = torch.compile(model.imagine, dynamic=False) if compiled else model.imagine
+    imagine(state, action, draws)
     return {
         "observe": lambda: model.observe(state, frame, action, draws),
-        "imagine": lambda: model.imagine(state, action, draws),
+        "imagine": lambda: imagine(state, action, draws),
     }
 
 

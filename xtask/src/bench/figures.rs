@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{Beside, Line, MANY, PRESETS};
+use super::{Beside, Line, MANY, PRESETS, Round};
 
 /// Each figure by preset and name, such as `push1.imagine_vs_twin_n64`.
 pub(super) fn figures(lines: &[Line]) -> BTreeMap<String, f64> {
@@ -15,6 +15,10 @@ pub(super) fn figures(lines: &[Line]) -> BTreeMap<String, f64> {
                 "imagine" => put(format!("imagine_vs_twin_n{}", line.batch), ratio),
                 _ => put(format!("observe_vs_twin_n{}", line.batch), ratio),
             };
+            if line.rounds.iter().all(|round| round.compiled.is_some()) {
+                let compiled = |round: &Round| round.compiled.unwrap_or(f64::NAN) / round.rust;
+                put(format!("imagine_vs_compile_n{}", line.batch), line.median(compiled));
+            }
             if line.rounds.iter().any(|round| round.beside.is_some()) {
                 let beside = |of: &dyn Fn(f64, &Beside) -> f64| {
                     line.median(|round| {
@@ -24,7 +28,7 @@ pub(super) fn figures(lines: &[Line]) -> BTreeMap<String, f64> {
                 let rows = MANY as f64 / line.batch as f64;
                 put("row_cost_512_over_64".to_owned(), beside(&|rust, b| b.many / rust / rows));
                 put("roofline_share".to_owned(), beside(&|rust, b| b.macs / rust / b.multiply));
-                put("session_bytes".to_owned(), beside(&|_, b| b.state));
+                put("state_bytes".to_owned(), beside(&|_, b| b.state));
             }
         }
     }
@@ -41,10 +45,7 @@ pub(super) fn print(figures: &BTreeMap<String, f64>) {
 
 #[cfg(test)]
 mod tests {
-    use super::{
-        super::{Round, lines},
-        *,
-    };
+    use super::{super::lines, *};
 
     #[test]
     fn figures_follow_from_the_rounds() {
@@ -52,7 +53,8 @@ mod tests {
         for line in &mut lines {
             let beside = Beside { many: 20.0, multiply: 100.0, macs: 60.0, state: 1000.0 };
             let beside = (line.step == "imagine").then_some(beside);
-            line.rounds = vec![Round { rust: 2.0, twin: [5.0, 6.0], beside }];
+            let compiled = beside.is_some().then_some(3.0);
+            line.rounds = vec![Round { rust: 2.0, twin: [5.0, 6.0], compiled, beside }];
         }
         let figures = figures(&lines);
         let close = |name: &str, figure: f64| assert!((figures[name] - figure).abs() < 1e-9);
@@ -60,6 +62,7 @@ mod tests {
         close("tiny.observe_vs_twin_n64", 2.5);
         close("tiny.row_cost_512_over_64", 1.25);
         close("tiny.roofline_share", 0.3);
-        close("tiny.session_bytes", 1000.0);
+        close("tiny.state_bytes", 1000.0);
+        close("tiny.imagine_vs_compile_n64", 1.5);
     }
 }
