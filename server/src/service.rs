@@ -24,7 +24,7 @@ mod start;
 
 use std::{
     ops::Deref,
-    sync::Arc,
+    sync::{Arc, atomic::AtomicU64},
     time::{Duration, Instant},
 };
 
@@ -62,6 +62,8 @@ pub struct Shared {
     engine: Engine,
     catalogue: Catalogue,
     registry: Registry,
+    /// Seeds that were drawn for sessions.
+    seeds: AtomicU64,
     handles: Opened,
     goals: goals::Kept,
     limits: v1::Limits,
@@ -112,6 +114,7 @@ impl Service {
             engine,
             catalogue: Catalogue::new(models),
             registry: Registry::new(kept),
+            seeds: AtomicU64::default(),
             handles: Opened::default(),
             goals: goals::Kept::default(),
             limits,

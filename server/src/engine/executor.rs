@@ -1,11 +1,16 @@
 //! The model's thread: takes commands in, computes what the schedulers say, lets models go.
 //!
 //! A tick at a time: first the observes of all models, then steps of rollouts, for which models share the time of a
-//! tick. Nothing here waits while there is work.
+//! tick. While there is work nothing here waits, but for observes that come at the same time as others.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    sync::Arc,
+    thread::sleep,
+    time::{Duration, Instant},
+};
 
-use tokio::sync::mpsc;
+use tokio::sync::mpsc::{self, error::TryRecvError};
 
 use super::{
     EngineConfig,
@@ -15,6 +20,13 @@ use super::{
     scheduler::{JobId, Tick},
     served::Served,
 };
+
+/// How long an observe waits for others to share its block, where blocks hold more than one: a block takes as long
+/// whether or not it is full, and robots that were answered together come again together.
+const GATHER: Duration = Duration::from_millis(2);
+
+/// How often they are looked for.
+const LOOK: Duration = Duration::from_micros(100);
 
 /// The state of the model's thread.
 pub(super) struct Executor {
@@ -47,7 +59,21 @@ impl Executor {
             while let Ok(command) = self.commands.try_recv() {
                 self.accept(command);
             }
+            self.gather();
             self.tick();
+        }
+    }
+
+    fn gather(&mut self) {
+        let until = Instant::now() + GATHER;
+        while self.served.values().any(|served| served.scheduler().has_room())
+            && Instant::now() < until
+        {
+            match self.commands.try_recv() {
+                Ok(command) => self.accept(command),
+                Err(TryRecvError::Empty) => sleep(LOOK),
+                Err(TryRecvError::Disconnected) => return,
+            }
         }
     }
 

@@ -139,6 +139,11 @@ impl Scheduler {
         self.live.is_empty() && self.bulk.is_empty() && self.shares.tenants() == 0
     }
 
+    /// Whether a live observe waits in a block that others could join.
+    pub fn has_room(&self) -> bool {
+        (1..self.sizes.observe_block).contains(&self.live.len())
+    }
+
     /// Tenants that have rollouts.
     pub fn tenants(&self) -> usize {
         self.shares.tenants()

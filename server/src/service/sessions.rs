@@ -1,7 +1,7 @@
 //! Sessions: opened, told about, forked, rewound and closed.
 
 use std::{
-    sync::Arc,
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant, SystemTime},
 };
 
@@ -15,6 +15,9 @@ use crate::{
         session::{Draws, History, Position, Session, SessionId, Terms},
     },
 };
+
+/// More lanes than blocks have.
+const LANES: u64 = 1 << 12;
 
 /// Characters of a label.
 const LABEL: usize = 128;
@@ -32,7 +35,7 @@ impl Service {
         let position = Position {
             draws: Draws {
                 sample: fields::samples(request.mode, "mode")?,
-                seed: request.seed.unwrap_or_else(fields::random_seed),
+                seed: request.seed.unwrap_or_else(|| self.next_seed()),
             },
             next_step: 0,
             state: Arc::clone(&model.initial),
@@ -49,6 +52,13 @@ impl Service {
         };
         let session = self.open(&terms, position)?;
         Ok(v1::CreateSessionResponse { session: Some(session) })
+    }
+
+    /// A seed for a session that brings none. A row's lane in its block follows from the seed, so the last bits count:
+    /// sessions that were opened one after the other fill a block.
+    fn next_seed(&self) -> u64 {
+        let lane = self.seeds.fetch_add(1, Ordering::Relaxed) % LANES;
+        fields::random_seed() / LANES * LANES + lane
     }
 
     /// Tells about a session.

@@ -66,7 +66,7 @@ fn imagine(checkpoint: &Path, candidates: i64, horizon: i64, time: Duration) -> 
             let noise = PhiloxNoise::new(vec![row; candidates as usize], Device::Cpu);
             let step = world.imagine(&state, &actions.select(0, depth), &noise, objects);
             let table = step.1.objects.context("no objects")?;
-            let _ids = Vec::<i64>::try_from(table.ids.view(-1))?;
+            let _ids = Vec::<i64>::try_from(table.ids.reshape([-1]))?;
             let _values = Vec::<f32>::try_from(table.values.reshape([-1]))?;
             state = step.0;
         }

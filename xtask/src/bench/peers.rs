@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use fs_err as fs;
+use rustix::process::{Pid, Signal, kill_process_group};
 
 use super::side::Side;
 use super::{Arguments, Tools, median, progress};
@@ -34,7 +35,7 @@ const GRACE: Duration = Duration::from_secs(10);
 /// A server under load.
 struct Peer {
     load: Side,
-    _process: Running,
+    process: Option<Running>,
 }
 
 /// Where everything of the peers is.
@@ -53,7 +54,7 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
     let place = Place::new(tools)?;
     let seconds = if arguments.quick { 2.0 } else { 8.0 };
     let mut server = Command::new(tools.programs.named("gatsbi-server")?);
-    server.args(["--threads", "2", "--observe-block", "8", "--checkpoint"]).arg(&place.checkpoint);
+    server.args(["--threads", "2", "--observe-block", "16", "--checkpoint"]).arg(&place.checkpoint);
     let log = tools.folder.path().join("server.log");
     let server = Server::start(&mut server, &log, &tools.interrupt)?;
     let mut ours = load(tools, OURS, &server.grpc)?;
@@ -165,15 +166,15 @@ impl Place {
             .stdout(log.try_clone()?)
             .stderr(log)
             .process_group(0);
-        let process = Running::start(&mut command, GRACE)?;
+        let mut process = Running::start(&mut command, GRACE)?;
         let url = format!("http://127.0.0.1:{port}");
         let began = Instant::now();
         loop {
             tools.interrupt.check()?;
             let mut load = load(tools, name, &url)?;
             match load.ask("observe 1 0") {
-                Ok(_) => return Ok(Peer { load, _process: process }),
-                Err(error) if began.elapsed() > PATIENCE => {
+                Ok(_) => return Ok(Peer { load, process: Some(process) }),
+                Err(error) if began.elapsed() > PATIENCE || process.child.try_wait()?.is_some() => {
                     let log = fs::read_to_string(&self.log)?;
                     bail!("{name} does not answer ({error:#}):\n{log}");
                 }
@@ -208,6 +209,16 @@ impl Place {
         command.args(["--allow-grpc", "false", "--allow-metrics", "false"]);
         command.env("LD_LIBRARY_PATH", libraries);
         Ok(command)
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let Some(process) = self.process.take() else { return };
+        let group = Pid::from_child(&process.child);
+        drop(process);
+        // Some leave their workers behind; where none is left there is no such group.
+        let _ = kill_process_group(group, Signal::KILL);
     }
 }
 

@@ -1,10 +1,15 @@
 """The twin as a model of Triton's Python backend."""
 
+import os
+import sys
 from typing import Any
 
-import numpy as np
-import triton_python_backend_utils as backend
-from core import Core
+# Triton's interpreter does not look there by itself.
+sys.path[:0] = os.environ["PYTHONPATH"].split(os.pathsep)
+
+import numpy as np  # noqa: E402
+import triton_python_backend_utils as backend  # noqa: E402
+from core import Core  # noqa: E402
 
 
 class TritonPythonModel:
