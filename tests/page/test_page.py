@@ -5,12 +5,14 @@ import re
 import statistics
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import expect
 
 import gatsbi_client as gc
 
+ROOT = Path(__file__).resolve().parents[2]
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
 
 
@@ -73,6 +75,9 @@ def test_a_session_shows_its_belief_and_follows_it(open_page, server, arm, shots
     at_step(page, step)
     rows = page.locator("table.objects tbody tr")
     assert rows.count() >= 2
+    colours = rows.locator("visible=true").evaluate_all(
+        "rows => rows.filter(row => !row.classList.contains('faint')).map(row => row.querySelector('.mark').style.background)")
+    assert len(set(colours)) == len(colours) >= 1 and "" not in colours
     # Every overlay changes the picture, and changes it back.
     for name in ["Agent", "Objects", "Background", "Boxes and ids", "Keypoints"]:
         before = picture(page)
@@ -93,6 +98,22 @@ def test_a_session_shows_its_belief_and_follows_it(open_page, server, arm, shots
         page.get_by_role("button", name="overlay.png").click()
     assert saved.value.suggested_filename == "overlay.png"
     page.screenshot(path=shots / "session.png", full_page=True)
+
+
+def test_objects_have_the_colours_of_the_servers_and_the_command_lines_pictures(open_page):
+    page = open_page()
+    agent, palette = page.evaluate("""import("/page/palette.js").then(({ AGENT, coloursOf }) =>
+        [AGENT, [...coloursOf([0, 1, 2, 3, 4, 5, 6, 7]).values()]])""")
+    for source in ["server/src/pictures/palette.rs", "client/src/bin/gatsbi/picture/palette.rs"]:
+        text = (ROOT / source).read_text()
+        text = text[: text.index("The colours of the objects in one picture")]
+        colours = re.findall(r"Rgb\(\[(\d+), (\d+), (\d+)\]\)", text)
+        assert ["#%02x%02x%02x" % tuple(map(int, colour)) for colour in colours] == [agent, *palette], source
+    places = lambda ids: page.evaluate("""ids => import("/page/palette.js").then(({ coloursOf }) =>
+        ids.map((id) => coloursOf(ids).get(id)))""", ids)
+    assert places([11, 3, 19]) == [palette[at] for at in (4, 3, 5)]
+    assert places([7, 15]) == [palette[at] for at in (7, 0)]
+    assert places([8 * i for i in range(10)]) == palette + palette[:2]
 
 
 def test_futures_are_imagined_and_compared_with_what_happened(open_page, server, arm, shots):

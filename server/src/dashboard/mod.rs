@@ -36,6 +36,7 @@ const FILES: &[(&str, &str, &str)] = &[
     ("/page/imagine.js", SCRIPT, include_str!("page/imagine.js")),
     ("/page/markdown.js", SCRIPT, include_str!("page/markdown.js")),
     ("/page/models.js", SCRIPT, include_str!("page/models.js")),
+    ("/page/palette.js", SCRIPT, include_str!("page/palette.js")),
     ("/page/scene.js", SCRIPT, include_str!("page/scene.js")),
     ("/page/session.js", SCRIPT, include_str!("page/session.js")),
     ("/page/sessions.js", SCRIPT, include_str!("page/sessions.js")),

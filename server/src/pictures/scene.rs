@@ -1,13 +1,16 @@
 //! One step painted: as it was seen, as the model has it, its masks, and all of it in one picture.
 
+use std::collections::BTreeMap;
+
 use gatsbi_models::scene::Output;
 use gatsbi_proto::v1;
 use image::{Rgb, RgbImage};
 
 use super::{
-    AGENT, byte,
+    byte,
     canvas::{Canvas, sheet},
-    colour_of, enlarge,
+    enlarge,
+    palette::{AGENT, colours},
 };
 use crate::{frame::Frame, sessions::live::Shown};
 
@@ -89,8 +92,9 @@ impl Scene {
         let (width, height) = self.picture.dimensions();
         let tinted = self.tinted(self.picture.clone(), TINT, true);
         let mut canvas = Canvas(enlarge(&tinted, scale));
+        let colours = self.colours();
         for (object, _) in &self.objects {
-            let colour = colour_of(object.id);
+            let colour = colours[&object.id];
             let side = |share: f32, pixels: u32| (share * (pixels * scale) as f32).round();
             let (w, h) = (side(object.width, width), side(object.height, height));
             let middle = |x: f32, pixels: u32| f32::midpoint(x, 1.0) * (pixels * scale) as f32;
@@ -138,9 +142,14 @@ impl Scene {
         agent.chain(objects).fold(255, u8::saturating_sub)
     }
 
+    fn colours(&self) -> BTreeMap<u64, Rgb<u8>> {
+        colours(self.objects.iter().map(|(object, _)| object.id))
+    }
+
     fn tinted(&self, mut ground: RgbImage, strength: f32, with_agent: bool) -> RgbImage {
         let agent = self.agent.iter().filter(|_| with_agent).map(|mask| (AGENT, mask));
-        let objects = self.objects.iter().map(|(object, mask)| (colour_of(object.id), mask));
+        let colours = self.colours();
+        let objects = self.objects.iter().map(|(object, mask)| (colours[&object.id], mask));
         for (colour, mask) in agent.chain(objects) {
             for (pixel, share) in ground.pixels_mut().zip(mask) {
                 *pixel = mix(*pixel, colour, f32::from(*share) / 255.0 * strength);
@@ -194,9 +203,9 @@ mod tests {
         let overlay = scene().overlay(3);
         assert_eq!(overlay.dimensions(), (48, 48));
         // Centre (36, 12), 24 pixels wide and high.
-        assert_eq!(overlay.get_pixel(24, 23), &colour_of(1));
-        assert_eq!(overlay.get_pixel(47, 23), &colour_of(1));
-        assert_ne!(overlay.get_pixel(30, 18), &colour_of(1));
+        assert_eq!(overlay.get_pixel(24, 23), &scene().colours()[&1]);
+        assert_eq!(overlay.get_pixel(47, 23), &scene().colours()[&1]);
+        assert_ne!(overlay.get_pixel(30, 18), &scene().colours()[&1]);
     }
 
     #[test]

@@ -3,6 +3,9 @@
 //!
 //! Actions are searched in units where the limits of every dimension are -1 and 1.
 
+#[cfg(test)]
+mod reference;
+
 use std::cmp::Ordering;
 
 use super::noise::Draws;

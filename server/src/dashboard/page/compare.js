@@ -2,7 +2,8 @@
 
 import { bitmap } from "./api.js";
 import { calm, colour, h, number, put } from "./dom.js";
-import { box, difference, PRESENT } from "./scene.js";
+import { coloursOf } from "./palette.js";
+import { box, difference, present } from "./scene.js";
 
 const FRAME_MS = 220;
 
@@ -130,7 +131,10 @@ export class Compare {
     }
     pen.drawImage(frame.picture, 0, 0, canvas.width, canvas.height);
     pen.lineWidth = 1.5;
-    if (this.boxes.checked) frame.objects.filter((object) => object.presence > PRESENT).forEach((object) => box(pen, object, canvas.width, 1.5));
+    if (!this.boxes.checked) return;
+    const there = present(frame.objects);
+    const colours = coloursOf(there.map((object) => object.id));
+    for (const object of there) box(pen, object, colours.get(object.id), { side: canvas.width, line: 1.5 });
   }
 
   start() {

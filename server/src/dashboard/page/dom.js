@@ -45,17 +45,6 @@ export const calm = () => matchMedia("(prefers-reduced-motion: reduce)").matches
 /** A colour of the style sheet, as it is now. */
 export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-const OBJECTS = ["#e6194b", "#ffc800", "#3cb44b", "#f58230", "#c83cdc", "#00c8be", "#aadc28", "#f078aa"];
-
-/** The colour of the agent, in every picture. */
-export const AGENT = "#0096ff";
-
-/** The colour of an object, the same as in the server's pictures. */
-export const colourOf = (id) => OBJECTS[Number(BigInt(id) % 8n)];
-
-/** Red, green and blue of `#rrggbb`. */
-export const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
-
 /** What a page says where there is nothing to show. */
 export function empty(title, ...lines) {
   return h("section", { className: "empty" }, h("h2", {}, title), lines.map((line) => (typeof line === "string" ? h("p", {}, line) : line)));

@@ -2,7 +2,8 @@
 // pixels, and are enlarged without blur; lines are drawn as fine as the screen is.
 
 import { bitmap } from "./api.js";
-import { AGENT, colour, colourOf, rgb } from "./dom.js";
+import { colour } from "./dom.js";
+import { AGENT, coloursOf, rgb } from "./palette.js";
 
 const TINT = 0.55;
 /** How surely an object must be there to be shown. */
@@ -60,8 +61,9 @@ export class SceneCanvas {
     pen.fillStyle = colour("--well");
     pen.fillRect(0, 0, side, side);
     if (picture) pen.drawImage(picture, 0, 0, side, side);
-    this.tint(pen, side, event, pictures.masks, layers);
-    const there = event.objects.filter((object) => object.presence > PRESENT);
+    const there = present(event.objects);
+    const colours = coloursOf(there.map((object) => object.id));
+    this.tint(pen, side, event, pictures.masks, { layers, colours });
     const line = Math.max(side / 256, 1.5);
     pen.lineWidth = line;
     pen.lineJoin = pen.lineCap = "round";
@@ -69,7 +71,7 @@ export class SceneCanvas {
     if (layers.has("trails")) {
       for (const { id } of there) {
         const places = trails.get(id) ?? [];
-        pen.strokeStyle = colourOf(id);
+        pen.strokeStyle = colours.get(id);
         for (let i = 1; i < places.length; i++) {
           pen.globalAlpha = 0.15 + (0.85 * i) / places.length;
           pen.beginPath();
@@ -80,7 +82,7 @@ export class SceneCanvas {
         pen.globalAlpha = 1;
       }
     }
-    if (layers.has("boxes")) for (const object of there) box(pen, object, side, line);
+    if (layers.has("boxes")) for (const object of there) box(pen, object, colours.get(object.id), { side, line });
     if (layers.has("keypoints")) {
       for (const [x, y, strength] of event.keypoints ?? []) {
         pen.globalAlpha = Math.max(0.1, Math.min(strength, 1));
@@ -96,7 +98,7 @@ export class SceneCanvas {
     if (target) cross(pen, at(target.x), at(target.y), line);
   }
 
-  tint(pen, side, event, masks, layers) {
+  tint(pen, side, event, masks, { layers, colours }) {
     const size = event.image_size;
     if (this.small.width !== size) this.small = new OffscreenCanvas(size, size);
     const image = new ImageData(size, size);
@@ -116,7 +118,7 @@ export class SceneCanvas {
     if (layers.has("background")) paint(rest(masks, size), [150, 110, 255]);
     for (const [whose, mask] of masks) {
       if (whose === "agent" ? layers.has("agent") : layers.has("objects")) {
-        paint(mask, rgb(whose === "agent" ? AGENT : colourOf(whose.slice(7))));
+        paint(mask, rgb(whose === "agent" ? AGENT : colours.get(Number(whose.slice(7)))));
       }
     }
     if (!any) return;
@@ -134,18 +136,25 @@ function rest(masks, size) {
   return left;
 }
 
+/** The objects that are there. */
+export const present = (objects) => objects.filter((object) => object.presence > PRESENT);
+
 /** An object's box with its identity above. */
-export function box(pen, object, side, line) {
+export function box(pen, object, colour, { side, line }) {
   const width = object.width * side, height = object.height * side;
   const left = ((object.x + 1) / 2) * side - width / 2, top = ((object.y + 1) / 2) * side - height / 2;
   if (![left, top, width, height].every(Number.isFinite)) return;
-  pen.strokeStyle = colourOf(object.id);
-  pen.strokeRect(left, top, width, height);
+  // Dark beside light, so that it is seen on any picture.
+  for (const [style, wide] of [["rgb(0 0 0 / 45%)", line * 2], [colour, line]]) {
+    pen.strokeStyle = style;
+    pen.lineWidth = wide;
+    pen.strokeRect(left, top, width, height);
+  }
   const text = String(object.id), letter = line * 8;
   pen.font = `600 ${letter}px ui-sans-serif, system-ui, sans-serif`;
   const wide = pen.measureText(text).width + letter * 0.6;
   const above = Math.max(top - letter * 1.25, 0);
-  pen.fillStyle = colourOf(object.id);
+  pen.fillStyle = colour;
   pen.fillRect(left - line / 2, above, wide, letter * 1.25);
   pen.fillStyle = "#16181b";
   pen.fillText(text, left + letter * 0.3 - line / 2, above + letter);

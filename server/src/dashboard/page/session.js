@@ -2,9 +2,10 @@
 
 import { ask, file, follow } from "./api.js";
 import { Chart } from "./chart.js";
-import { colourOf, empty, failure, h, millis, number, put, short } from "./dom.js";
+import { empty, failure, h, millis, number, put, short } from "./dom.js";
 import { Imagine } from "./imagine.js";
-import { decode, LAYERS, PRESENT, SceneCanvas } from "./scene.js";
+import { coloursOf } from "./palette.js";
+import { decode, LAYERS, PRESENT, present, SceneCanvas } from "./scene.js";
 
 const KEPT = 100;
 const TRAIL = 30;
@@ -167,8 +168,7 @@ class View {
     this.table.show(event);
     if (performance.now() - (this.said ?? -9999) > 5000) {
       this.said = performance.now();
-      const count = event.objects.filter((object) => object.presence > PRESENT).length;
-      this.canvas.setAttribute("aria-label", `Step ${event.step}: ${count} objects; they are in the table`);
+      this.canvas.setAttribute("aria-label", `Step ${event.step}: ${present(event.objects).length} objects; they are in the table`);
     }
   }
 }
@@ -192,9 +192,12 @@ class Objects {
         this.rows.delete(id);
       }
     }
+    const colours = coloursOf(present(event.objects).map((object) => object.id));
     for (const object of event.objects) {
       if (!this.rows.has(object.id)) this.rows.set(object.id, this.row(object.id));
-      const { row, bar, cells } = this.rows.get(object.id);
+      const { row, mark, bar, cells } = this.rows.get(object.id);
+      // What is not in the picture has no colour there.
+      mark.style.background = colours.get(object.id) ?? "none";
       row.classList.toggle("faint", object.presence <= PRESENT);
       bar.value = object.presence;
       bar.title = number(object.presence, 2);
@@ -205,12 +208,11 @@ class Objects {
 
   row(id) {
     const mark = h("i", { className: "mark", "aria-hidden": "true" });
-    mark.style.background = colourOf(id);
     const bar = h("meter", { min: 0, max: 1, "aria-label": `presence of object ${id}` });
     const cells = Array.from({ length: 5 }, () => h("td", {}));
     const row = h("tr", {}, h("th", { scope: "row" }, mark, String(id)), h("td", {}, bar), cells);
     this.body.append(row);
-    return { row, bar, cells };
+    return { row, mark, bar, cells };
   }
 }
 

@@ -1,11 +1,17 @@
 //! One step painted: its masks, what they cut out of the frame, and all of it over the frame.
 
+use std::collections::BTreeMap;
+
 use embedded_graphics::mono_font::ascii::FONT_6X10;
 use gatsbi_client::{Array, Object};
 use gatsbi_episodes::LabelLegend;
 use image::{Rgb, RgbImage};
 
-use super::{AGENT, canvas::Canvas, colour_of, enlarge};
+use super::{
+    canvas::Canvas,
+    enlarge,
+    palette::{AGENT, colours},
+};
 
 /// How strongly masks tint.
 const TINT: f32 = 0.5;
@@ -36,10 +42,11 @@ pub(crate) fn cut_out(frame: &RgbImage, mask: &[f32]) -> RgbImage {
 
 /// A recording's labels in the colours of agent and objects.
 pub(crate) fn labelled(size: (u32, u32), labels: &[u8], legend: LabelLegend) -> RgbImage {
+    let id = |label: u8| label.checked_sub(legend.first_object).map(u64::from);
+    let colours = colours(labels.iter().filter_map(|label| id(*label)));
     paint(size, |at| match labels[at] {
         label if label == legend.agent => AGENT,
-        label if label >= legend.first_object => colour_of((label - legend.first_object).into()),
-        _ => DARK,
+        label => id(label).map_or(DARK, |id| colours[&id]),
     })
 }
 
@@ -73,8 +80,9 @@ impl Scene {
     pub(crate) fn boxed(&self, picture: &RgbImage, times: u32) -> RgbImage {
         let (width, height) = picture.dimensions();
         let mut canvas = Canvas(enlarge(picture, times));
+        let colours = self.colours();
         for (object, _) in &self.objects {
-            let colour = colour_of(object.id);
+            let colour = colours[&object.id];
             let side = |share: f32, pixels: u32| (share * (pixels * times) as f32).round();
             let (w, h) = (side(object.width, width), side(object.height, height));
             let middle = |x: f32, pixels: u32| f32::midpoint(x, 1.0) * (pixels * times) as f32;
@@ -88,10 +96,15 @@ impl Scene {
         canvas.0
     }
 
+    fn colours(&self) -> BTreeMap<u64, Rgb<u8>> {
+        colours(self.objects.iter().map(|(object, _)| object.id))
+    }
+
     fn tinted(&self, ground: RgbImage, strength: f32, with_agent: bool) -> RgbImage {
         let mut picture = ground;
         let agent = self.agent.iter().filter(|_| with_agent).map(|mask| (AGENT, mask));
-        let objects = self.objects.iter().map(|(object, mask)| (colour_of(object.id), mask));
+        let colours = self.colours();
+        let objects = self.objects.iter().map(|(object, mask)| (colours[&object.id], mask));
         for (colour, mask) in agent.chain(objects) {
             for (pixel, share) in picture.pixels_mut().zip(mask) {
                 *pixel = mix(*pixel, colour, share * strength);
@@ -139,7 +152,7 @@ mod tests {
     fn masks_tint_what_they_cover() {
         let scene = scene();
         let objects = scene.objects();
-        assert_eq!(objects.get_pixel(12, 4), &colour_of(1));
+        assert_eq!(objects.get_pixel(12, 4), &scene.colours()[&1]);
         assert_eq!((objects.get_pixel(0, 0), objects.get_pixel(12, 5)), (&DARK, &DARK));
         let overlay = scene.overlay(1);
         assert_eq!(overlay.get_pixel(0, 0), &mix(Rgb([100; 3]), AGENT, TINT));
@@ -155,7 +168,8 @@ mod tests {
         let legend = LabelLegend { background: 0, agent: 1, first_object: 2 };
         let picture = labelled((4, 1), &[0, 1, 2, 4], legend);
         let colours: Vec<_> = picture.pixels().copied().collect();
-        assert_eq!(colours, [DARK, AGENT, colour_of(0), colour_of(2)]);
+        let objects = super::colours([0, 2]);
+        assert_eq!(colours, [DARK, AGENT, objects[&0], objects[&2]]);
     }
 
     #[test]
@@ -163,9 +177,9 @@ mod tests {
         let overlay = scene().overlay(3);
         assert_eq!(overlay.dimensions(), (48, 48));
         // Centre (36, 12), 24 pixels wide and high.
-        assert_eq!(overlay.get_pixel(24, 23), &colour_of(1));
-        assert_eq!(overlay.get_pixel(47, 23), &colour_of(1));
-        assert_ne!(overlay.get_pixel(30, 18), &colour_of(1));
+        assert_eq!(overlay.get_pixel(24, 23), &scene().colours()[&1]);
+        assert_eq!(overlay.get_pixel(47, 23), &scene().colours()[&1]);
+        assert_ne!(overlay.get_pixel(30, 18), &scene().colours()[&1]);
     }
 
     #[test]
