@@ -377,7 +377,10 @@ fn add_following(
             let pixels = model.config().image_size as f64 / 2.0;
             (z.narrow(-1, 0, 1), model.objects().drawn_centres(z) * pixels)
         };
-        let found = tch::no_grad(|| place(&model.objects().detect(frame, &mixture.mu_mix)));
+        let found = {
+            let _no_grad = tch::no_grad_guard();
+            place(&model.objects().detect(frame, &mixture.mu_mix))
+        };
         let objects = place(&state.objects.z);
         let distance =
             loss::following((&objects.0, &objects.1), (&found.0, &found.1), FOLLOWING_REACH);

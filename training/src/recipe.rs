@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::variant::Variant;
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 8] = [
+const NAMED: [(&str, &str); 9] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -20,6 +20,7 @@ const NAMED: [(&str, &str); 8] = [
     ("tiny", include_str!("../recipes/tiny.toml")),
     ("tiny-refine", include_str!("../recipes/tiny-refine.toml")),
     ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
+    ("tiny-finish", include_str!("../recipes/tiny-finish.toml")),
 ];
 
 /// How a model is trained.
@@ -333,6 +334,12 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects"), "{error}");
+        assert!(
+            error.contains(
+                "roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects, \
+             tiny-finish"
+            ),
+            "{error}"
+        );
     }
 }

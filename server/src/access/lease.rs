@@ -225,7 +225,7 @@ mod tests {
             let access = keys.access();
             let ended = tokio::spawn(keys.lease(&access).ended());
             // The same key again, now with an end and a higher role, changes nothing.
-            keys.hold("lab", Role::Admin, &secret, Some(Duration::from_secs(3600)));
+            keys.hold("lab", Role::Admin, &secret, Some(Duration::from_hours(1)));
             access.reload(QUOTA).unwrap();
             tokio::task::yield_now().await;
             assert!(!ended.is_finished());

@@ -181,7 +181,9 @@ fn step(world: &dyn WorldModel, batch: Batch) -> Computed {
         let frame = batch.frames.map(|frames| {
             let size = world.spec().image_size;
             let mut numbers = Vec::with_capacity(lanes * 3 * (size * size) as usize);
-            frames.iter().for_each(|frame| frame.append_to(&mut numbers));
+            for frame in frames {
+                frame.append_to(&mut numbers);
+            }
             tensor(&numbers).view([lanes as i64, 3, size, size])
         });
         world.observe(&state, frame.as_ref(), &action, &noise, outputs)

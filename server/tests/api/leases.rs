@@ -15,7 +15,7 @@ use crate::{
 };
 
 async fn soon<T>(answer: impl Future<Output = T>) -> T {
-    tokio::time::timeout(Duration::from_secs(60), answer).await.expect("it is there in time")
+    tokio::time::timeout(Duration::from_mins(1), answer).await.expect("it is there in time")
 }
 
 /// A server with keys, and the file that they are in.

@@ -22,7 +22,7 @@ use tokio::signal::unix::{SignalKind, signal};
 #[command(version)]
 enum Command {
     /// Serve a model that computes nothing; takes the settings of gatsbi-server
-    Null(Config),
+    Null(Box<Config>),
     /// Measure when told to: each line on standard input is answered by a line of numbers
     ///
     /// `imagine CHECKPOINT CANDIDATES HORIZON SECONDS` is answered by steps of rows a second of the model alone, objects
@@ -36,7 +36,7 @@ enum Command {
 
 fn main() -> Result<()> {
     match Command::parse() {
-        Command::Null(config) => tokio::runtime::Runtime::new()?.block_on(serve(config)),
+        Command::Null(config) => tokio::runtime::Runtime::new()?.block_on(serve(*config)),
         Command::Inside => answer(inside::measure),
         Command::Steps => {
             let mut steps = steps::Steps::new();

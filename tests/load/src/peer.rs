@@ -41,7 +41,7 @@ impl Peer {
         body.extend(std::iter::repeat_n(0.1f32.to_le_bytes(), actions).flatten());
         // Sequences of a run before must not be met again.
         let began = std::time::UNIX_EPOCH.elapsed().unwrap_or_default().as_millis() as u64;
-        let session = began << 8 | number + 1;
+        let session = (began << 8) | (number + 1);
         Self { kind, url: url.to_owned(), session, body, begun: false, client: Client::new() }
     }
 

@@ -43,7 +43,7 @@ impl Service {
     /// Connects. Nothing is repeated: what is refused is told.
     pub(crate) async fn connect(url: &str) -> Result<Self> {
         let retries = Retries { most: 0, ..Retries::default() };
-        let options = Options { retries, timeout: Duration::from_secs(60), ..Options::default() };
+        let options = Options { retries, timeout: Duration::from_mins(1), ..Options::default() };
         let client = Client::connect_with(url, options).await?;
         let model = client.models().await?.into_iter().next().context("no model is served")?;
         Ok(Self { client, side: model.image_size, actions: model.actions.len() })

@@ -27,7 +27,7 @@ const PEERS: [&str; 3] = ["triton", "mosec", "litserve"];
 const OURS: &str = "gatsbi";
 
 /// For a peer to load PyTorch and the model.
-const PATIENCE: Duration = Duration::from_secs(180);
+const PATIENCE: Duration = Duration::from_mins(3);
 
 /// For a peer to end in.
 const GRACE: Duration = Duration::from_secs(10);

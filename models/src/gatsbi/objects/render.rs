@@ -44,7 +44,8 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
 /// Centres `[B, N, 2]` of what is drawn for objects `z [B, N, Z]`; only the boxes' centres have a gradient.
 pub(crate) fn drawn_centres(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Tensor {
     let Latents { place, what, .. } = layout.split(z);
-    let within = tch::no_grad(|| {
+    let within = {
+        let _no_grad = tch::no_grad_guard();
         let alpha = decoder.forward(&what).select(2, 3); // [B, N, s, s]
         let line = pixel_centres(alpha.size()[3], &alpha);
         let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
@@ -53,7 +54,7 @@ pub(crate) fn drawn_centres(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout
             (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
         };
         Tensor::stack(&[centre(2), centre(3)], -1) * place.narrow(-1, 0, 2)
-    });
+    };
     place.narrow(-1, 2, 2) + within
 }
 

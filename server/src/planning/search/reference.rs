@@ -23,7 +23,8 @@ struct Record {
 
 #[derive(Deserialize)]
 struct Function {
-    function: String,
+    #[serde(rename = "function")]
+    name: String,
     steps: usize,
     width: usize,
     low: f32,
@@ -78,7 +79,7 @@ impl Function {
 
     /// The cost of actions, as `record.py` has it.
     fn cost(&self, actions: &[f32]) -> f32 {
-        match self.function.as_str() {
+        match self.name.as_str() {
             "sphere" => actions.iter().map(|x| (x - 0.4).powi(2)).sum(),
             "rosenbrock" => {
                 let pairs = zip(actions, &actions[1..]);
@@ -155,7 +156,7 @@ fn the_same_samples_lead_to_the_same_distribution() {
             assert_eq!(search.proposed.len(), iteration.count);
             search.learn(&ranks(iteration.costs.iter().copied()));
 
-            let place = format!("{optimiser} on {}, iteration {number}", function.function);
+            let place = format!("{optimiser} on {}, iteration {number}", function.name);
             for (mean, expected) in zip(space.raw(&search.mean), &iteration.mean) {
                 let off = f64::from((mean - expected).abs());
                 assert!(off < TOLERANCE, "{place}: the mean {mean} is not {expected}");
@@ -218,7 +219,7 @@ fn plans_are_no_worse_than_most_of_theirs() {
         let at = |sorted: &[f64], share: f64| sorted[(sorted.len() as f64 * share) as usize];
         // Half of ours are better than the worst tenth of theirs.
         let (ours, theirs) = (at(&found, 0.5), at(&least, 0.9));
-        let place = format!("{optimiser} on {}", function.function);
+        let place = format!("{optimiser} on {}", function.name);
         assert!(ours < theirs, "{place}: the median is {ours}, and theirs stay below {theirs}");
     }
 }
