@@ -440,12 +440,10 @@ pub enum AgentHistory {
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum AgentFeature {
-    /// Those of t - 1: an object remembers a step as soon as it is over (the original's order). What the robot does
-    /// moves an object one step late.
+    /// Those of t - 1: an object remembers a step as soon as it is over (the original), and is pushed a step late.
     #[default]
     Current,
-    /// Those of t: an object remembers a step when the next one begins, beside the agent and the `mu_mix` of that one.
-    /// They are known then even in imagination, because agent and background step first.
+    /// Those of t, which step before the objects: an object remembers a step when the next one begins, beside its agent.
     Next,
 }
 
