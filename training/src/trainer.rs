@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use gatsbi_models::{
     checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
-    config::{GatsbiConfig, Tracking, presets},
+    config::{GatsbiConfig, presets},
     gatsbi::{
         keypoint::KeypointLearning,
         model::{GradientStops, Observing},
@@ -83,9 +83,9 @@ impl Trainer {
         model.action.dim = clips.actions.len() as i64;
         recipe.variant.apply(&mut model);
         if let Some(objects) = &recipe.objects {
-            let Tracking { scale_bounds, merge, .. } = training_tracking(Some(objects));
-            model.tracking.scale_bounds = scale_bounds.or(model.tracking.scale_bounds);
-            model.tracking.merge = merge;
+            let tracking = &mut model.tracking;
+            tracking.scale_bounds = objects.scale_bounds.or(tracking.scale_bounds);
+            tracking.merge = objects.merge;
         }
         let mut header = untrained::header(&recipe.name, model, clips.actions.clone(), seed);
         header.frame_period = Some(clips.frame_period);

@@ -1,9 +1,10 @@
 //! What the service takes, beside what else could be used.
 //!
-//! First, steps of the Rust model beside its twin in PyTorch: same weights, one thread each, in turns. What counts is processor time, which leaves out the time in which others had the core. Others still slow memory and
-//! caches down, so the sides take turns at every step in every round, and the result is the median over the rounds of the
-//! ratio within a round. The twin runs eagerly, in both memory formats, and the faster one counts; and for 64 imagined rows
-//! under `torch.compile` too. What a step is, is said in `tests/load/engine/steps.rs` and
+//! First, steps of the Rust model beside its twin in PyTorch: same weights, one thread each, in turns. What counts is
+//! processor time, which leaves out the time in which others had the core. Others still slow memory and caches down, so
+//! the sides take turns at every step in every round, and the result is the median over the rounds of the ratio within
+//! a round. The twin runs eagerly, in both memory formats, and the faster one counts; and for 64 imagined rows under
+//! `torch.compile` too. What a step is, is said in `tests/load/engine/steps.rs` and
 //! `tests/reference/gatsbi_twin/timing.py`.
 //!
 //! Then [`service`]: what sessions, batching and connections cost. [`peers`] puts other servers beside ours. `figures` has

@@ -9,6 +9,7 @@ use serde_json::Value;
 
 const TORCH: &str = "torch-sys";
 const MODELS: &str = "gatsbi-models";
+const PICTURES: &str = "gatsbi-pictures";
 
 /// A room: what it may name among our crates, and what must not be in it, however deep.
 struct Room {
@@ -19,6 +20,7 @@ struct Room {
 
 const ROOMS: &[Room] = &[
     Room { package: "gatsbi-proto", may_name: &[], must_not_hold: &["axum", "clap"] },
+    Room { package: PICTURES, may_name: &[], must_not_hold: &["prost", "tokio"] },
     Room {
         package: MODELS,
         may_name: &[],
@@ -32,12 +34,12 @@ const ROOMS: &[Room] = &[
     },
     Room {
         package: "gatsbi-server",
-        may_name: &[MODELS, "gatsbi-episodes", "gatsbi-proto"],
+        may_name: &[MODELS, "gatsbi-episodes", PICTURES, "gatsbi-proto"],
         must_not_hold: &[],
     },
     Room {
         package: "gatsbi-client",
-        may_name: &["gatsbi-episodes", "gatsbi-proto"],
+        may_name: &["gatsbi-episodes", PICTURES, "gatsbi-proto"],
         must_not_hold: &[MODELS],
     },
     Room { package: "gatsbi-sim", may_name: &["gatsbi-episodes"], must_not_hold: &[] },

@@ -1,28 +1,21 @@
-//! Steps and rollouts painted as files that any program shows: PNG, and GIF where something moves.
+//! Steps and rollouts as files that any program shows: PNG, and GIF where something moves.
 //!
-//! [`scene`] paints one step, [`rollout`] many, in the colours of [`palette`]; [`canvas`] draws lines and letters and
-//! lays tiles out. A pixel of the model becomes a square of pixels, without blur: what is coarse should look coarse.
+//! [`scene`] makes a step's pictures, [`rollout`] those of many, [`sheet`] lays tiles out; what is painted how is said in
+//! `gatsbi-pictures`.
 
-pub mod palette;
 pub mod rollout;
 pub mod scene;
 
-mod canvas;
+mod sheet;
 
 use bytes::Bytes;
-use image::{RgbImage, imageops};
+use image::RgbImage;
 
 use crate::media;
 
 /// A picture as a PNG file.
 pub fn png(picture: &RgbImage) -> Bytes {
     media::png(picture.as_raw(), picture.dimensions(), 3)
-}
-
-/// Every pixel as a square.
-pub fn enlarge(picture: &RgbImage, times: u32) -> RgbImage {
-    let (width, height) = picture.dimensions();
-    imageops::resize(picture, width * times, height * times, imageops::FilterType::Nearest)
 }
 
 /// A number in [0, 1] as a byte.

@@ -2,14 +2,11 @@
 
 use std::{collections::BTreeMap, time::Duration};
 
+use gatsbi_pictures::{enlarge, scene::Scene};
 use gatsbi_proto::v1::{self, output_value::Value};
 use image::{Delay, DynamicImage, Frame, RgbImage, codecs::gif};
 
-use super::{
-    canvas::sheet,
-    enlarge,
-    scene::{PRESENT, Scene},
-};
+use super::{scene::painted, sheet::sheet};
 
 /// Speed of choosing a film's colours, of 1 to 30; it is no more than a few colours that differ.
 const SPEED: i32 = 20;
@@ -44,20 +41,20 @@ impl Pictures {
             let Some(picture) = RgbImage::from_raw(width, height, row(frames, at).to_vec()) else {
                 return;
             };
-            let agent = tensor(v1::Output::AgentMask).map(|masks| row(masks, at).to_vec());
+            let shares = |bytes: &[u8]| bytes.iter().map(|byte| f32::from(*byte) / 255.0).collect();
+            let agent = tensor(v1::Output::AgentMask).map(|masks| shares(&row(masks, at)));
             let masks = tensor(v1::Output::ObjectMasks).map(|masks| row(masks, at));
             let pixels = (width * height) as usize;
-            let objects = objects(chunk, at, rows * depths).into_iter().filter_map(|object| {
-                let mask = masks.as_ref()?.get(object.slot as usize * pixels..)?.get(..pixels)?;
-                (object.presence > PRESENT).then(|| (object, mask.to_vec()))
+            let objects = painted(&objects(chunk, at, rows * depths), |slot| {
+                Some(shares(masks.as_ref()?.get(slot * pixels..)?.get(..pixels)?))
             });
-            let scene = Scene { picture, agent, objects: objects.collect() };
-            let painted = match masks {
+            let scene = Scene { picture, agent, objects };
+            let tile = match masks {
                 Some(_) => scene.overlay(scale),
                 None => enlarge(&scene.picture, scale),
             };
             let (candidate, depth) = (chunk.first_candidate + at / depths, at % depths);
-            self.tiles.insert((candidate, chunk.depths[depth as usize]), painted);
+            self.tiles.insert((candidate, chunk.depths[depth as usize]), tile);
         }
     }
 

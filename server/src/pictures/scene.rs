@@ -1,26 +1,18 @@
-//! One step painted: as it was seen, as the model has it, its masks, and all of it in one picture.
-
-use std::collections::BTreeMap;
+//! A step's pictures: as it was seen, as the model has it, its masks, and all of it in one.
 
 use gatsbi_models::scene::Output;
+use gatsbi_pictures::{
+    enlarge,
+    scene::{Object, PRESENT, Scene, grey},
+};
 use gatsbi_proto::v1;
 use image::{Rgb, RgbImage};
 
-use super::{
-    byte,
-    canvas::{Canvas, sheet},
-    enlarge,
-    palette::{AGENT, colours},
-};
+use super::{byte, sheet::sheet};
 use crate::{frame::Frame, sessions::live::Shown};
 
-/// How strongly masks tint.
-const TINT: f32 = 0.5;
-const DARK: Rgb<u8> = Rgb([20; 3]);
 /// Tiles of a row of the sheet of masks.
 const COLUMNS: usize = 5;
-/// How surely an object must be there to be painted.
-pub const PRESENT: f32 = 0.5;
 
 /// Which picture of a step.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -30,17 +22,6 @@ pub enum Of {
     Camera,
     /// What the model makes of it.
     Belief,
-}
-
-/// A decomposed step. Masks are shares of the image's pixels times 255, row by row.
-#[derive(Clone, Debug)]
-pub struct Scene {
-    /// The picture that masks belong to.
-    pub picture: RgbImage,
-    /// The agent's mask.
-    pub agent: Option<Vec<u8>>,
-    /// Objects that are there, each with its mask.
-    pub objects: Vec<(v1::Object, Vec<u8>)>,
 }
 
 /// A frame of `[3, size, size]` as a picture.
@@ -72,148 +53,80 @@ fn belief(shown: &Shown) -> RgbImage {
     RgbImage::from_raw(size, size, bytes).unwrap_or_else(|| RgbImage::new(size, size))
 }
 
-impl Scene {
-    /// A step that is shown.
-    pub fn new(shown: &Shown, of: Of) -> Self {
-        let bytes = |numbers: Vec<f32>| numbers.into_iter().map(byte).collect::<Vec<u8>>();
-        let masks = bytes(shown.floats(Output::ObjectMasks).unwrap_or_default());
-        let pixels = (shown.image_size * shown.image_size) as usize;
-        let there = shown.objects.iter().filter(|object| object.presence > PRESENT);
-        let objects = there.filter_map(|object| {
-            let mask = masks.get(object.slot as usize * pixels..)?.get(..pixels)?;
-            Some((*object, mask.to_vec()))
-        });
-        let agent = shown.floats(Output::AgentMask).map(bytes);
-        Self { picture: picture(shown, of), agent, objects: objects.collect() }
-    }
-
-    /// The picture with tinted masks, and around each object its box and identity.
-    pub fn overlay(&self, scale: u32) -> RgbImage {
-        let (width, height) = self.picture.dimensions();
-        let tinted = self.tinted(self.picture.clone(), TINT, true);
-        let mut canvas = Canvas(enlarge(&tinted, scale));
-        let colours = self.colours();
-        for (object, _) in &self.objects {
-            let colour = colours[&object.id];
-            let side = |share: f32, pixels: u32| (share * (pixels * scale) as f32).round();
-            let (w, h) = (side(object.width, width), side(object.height, height));
-            let middle = |x: f32, pixels: u32| f32::midpoint(x, 1.0) * (pixels * scale) as f32;
-            let left = (middle(object.x, width) - w / 2.0).round() as i32;
-            let top = (middle(object.y, height) - h / 2.0).round() as i32;
-            canvas.outline((left, top), (w as u32, h as u32), colour);
-            // Above the box, or inside it at the upper edge.
-            let label = object.id.to_string();
-            canvas.text((left, (top - 10).max(0)), &label, DARK, Some(colour));
-        }
-        canvas.0
-    }
-
-    /// What was seen and what the model makes of it, then every mask in grey.
-    pub fn masks(shown: &Shown, scale: u32) -> RgbImage {
-        let scene = Self::new(shown, Of::Belief);
-        let size = scene.picture.dimensions();
-        let grey = |mask: &dyn Fn(usize) -> u8| {
-            RgbImage::from_fn(size.0, size.1, |x, y| Rgb([mask((y * size.0 + x) as usize); 3]))
-        };
-        let mut tiles: Vec<(String, RgbImage)> = Vec::new();
-        let mut add =
-            |caption: String, tile: &RgbImage| tiles.push((caption, enlarge(tile, scale)));
-        if shown.seen.frame.is_some() {
-            add("camera".to_owned(), &picture(shown, Of::Camera));
-        }
-        add("belief".to_owned(), &scene.picture);
-        if let Some(agent) = &scene.agent {
-            add("agent".to_owned(), &grey(&|at| agent[at]));
-        }
-        add("background".to_owned(), &grey(&|at| scene.background(at)));
-        let dark = RgbImage::from_pixel(size.0, size.1, DARK);
-        add("objects".to_owned(), &scene.tinted(dark, 1.0, false));
-        for (object, mask) in &scene.objects {
-            add(format!("object {}", object.id), &grey(&|at| mask[at]));
-        }
-        let rows: Vec<_> = tiles.chunks(COLUMNS).map(<[_]>::to_vec).collect();
-        sheet(&rows)
-    }
-
-    /// What is left of a pixel beside agent and objects that are there.
-    fn background(&self, at: usize) -> u8 {
-        let agent = self.agent.iter().map(|mask| mask[at]);
-        let objects = self.objects.iter().map(|(_, mask)| mask[at]);
-        agent.chain(objects).fold(255, u8::saturating_sub)
-    }
-
-    fn colours(&self) -> BTreeMap<u64, Rgb<u8>> {
-        colours(self.objects.iter().map(|(object, _)| object.id))
-    }
-
-    fn tinted(&self, mut ground: RgbImage, strength: f32, with_agent: bool) -> RgbImage {
-        let agent = self.agent.iter().filter(|_| with_agent).map(|mask| (AGENT, mask));
-        let colours = self.colours();
-        let objects = self.objects.iter().map(|(object, mask)| (colours[&object.id], mask));
-        for (colour, mask) in agent.chain(objects) {
-            for (pixel, share) in ground.pixels_mut().zip(mask) {
-                *pixel = mix(*pixel, colour, f32::from(*share) / 255.0 * strength);
-            }
-        }
-        ground
+/// A step that is shown, to be painted.
+pub fn scene(shown: &Shown, of: Of) -> Scene {
+    let masks = shown.floats(Output::ObjectMasks).unwrap_or_default();
+    let pixels = (shown.image_size * shown.image_size) as usize;
+    Scene {
+        picture: picture(shown, of),
+        agent: shown.floats(Output::AgentMask),
+        objects: painted(&shown.objects, |slot| {
+            Some(masks.get(slot * pixels..)?.get(..pixels)?.to_vec())
+        }),
     }
 }
 
-fn mix(from: Rgb<u8>, to: Rgb<u8>, share: f32) -> Rgb<u8> {
-    let channel = |i: usize| {
-        let (from, to) = (f32::from(from[i]), f32::from(to[i]));
-        (from + (to - from) * share).round() as u8
-    };
-    Rgb([channel(0), channel(1), channel(2)])
+/// Those objects that are there and have a mask, with it.
+pub(super) fn painted(
+    objects: &[v1::Object],
+    mask: impl Fn(usize) -> Option<Vec<f32>>,
+) -> Vec<(Object, Vec<f32>)> {
+    let there = objects.iter().filter(|object| object.presence > PRESENT);
+    let painted = there.filter_map(|told| {
+        let v1::Object { id, presence, x, y, width, height, .. } = *told;
+        Some((Object { id, presence, x, y, width, height }, mask(told.slot as usize)?))
+    });
+    painted.collect()
+}
+
+/// What was seen and what the model makes of it, then every mask in grey.
+pub fn masks(shown: &Shown, scale: u32) -> RgbImage {
+    let scene = scene(shown, Of::Belief);
+    let size = scene.picture.dimensions();
+    let mut tiles: Vec<(String, RgbImage)> = Vec::new();
+    let mut add = |caption: String, tile: &RgbImage| tiles.push((caption, enlarge(tile, scale)));
+    if shown.seen.frame.is_some() {
+        add("camera".to_owned(), &picture(shown, Of::Camera));
+    }
+    add("belief".to_owned(), &scene.picture);
+    if let Some(agent) = &scene.agent {
+        add("agent".to_owned(), &grey(size, agent));
+    }
+    add("background".to_owned(), &grey(size, &background(&scene)));
+    add("objects".to_owned(), &scene.objects_alone());
+    for (object, mask) in &scene.objects {
+        add(format!("object {}", object.id), &grey(size, mask));
+    }
+    let rows: Vec<_> = tiles.chunks(COLUMNS).map(<[_]>::to_vec).collect();
+    sheet(&rows)
+}
+
+/// What is left beside agent and objects that are there.
+fn background(scene: &Scene) -> Vec<f32> {
+    let mut left = vec![1.0; scene.picture.pixels().len()];
+    for mask in scene.agent.iter().chain(scene.objects.iter().map(|(_, mask)| mask)) {
+        for (left, share) in left.iter_mut().zip(mask) {
+            *left -= share;
+        }
+    }
+    left
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn scene() -> Scene {
-        let object = v1::Object {
-            id: 1,
-            presence: 1.0,
-            x: 0.5,
-            y: -0.5,
-            width: 0.5,
-            height: 0.5,
-            ..v1::Object::default()
+    #[test]
+    fn the_background_is_what_nothing_else_covers() {
+        let told = v1::Object { id: 1, presence: 1.0, slot: 1, ..v1::Object::default() };
+        let gone = v1::Object { presence: 0.2, ..told };
+        let masks = [vec![0.5; 4], vec![0.0, 1.0, 0.0, 0.25]];
+        let scene = Scene {
+            picture: RgbImage::new(2, 2),
+            agent: Some(vec![1.0, 0.0, 0.0, 0.25]),
+            objects: painted(&[told, gone], |slot| masks.get(slot).cloned()),
         };
-        let mut mask = vec![0; 16 * 16];
-        mask[4 * 16 + 12] = 255;
-        let mut agent = vec![0; 16 * 16];
-        agent[0] = 255;
-        let picture = RgbImage::from_pixel(16, 16, Rgb([100; 3]));
-        Scene { picture, agent: Some(agent), objects: vec![(object, mask)] }
-    }
-
-    #[test]
-    fn masks_tint_what_they_cover() {
-        let overlay = scene().overlay(1);
-        assert_eq!(overlay.get_pixel(0, 0), &mix(Rgb([100; 3]), AGENT, TINT));
-        assert_eq!(overlay.get_pixel(1, 15), &Rgb([100; 3]));
-        let (agent, object, free) = (0, 4 * 16 + 12, 255);
-        assert_eq!([agent, object, free].map(|at| scene().background(at)), [0, 0, 255]);
-    }
-
-    #[test]
-    fn boxes_lie_where_the_objects_are() {
-        let overlay = scene().overlay(3);
-        assert_eq!(overlay.dimensions(), (48, 48));
-        // Centre (36, 12), 24 pixels wide and high.
-        assert_eq!(overlay.get_pixel(24, 23), &scene().colours()[&1]);
-        assert_eq!(overlay.get_pixel(47, 23), &scene().colours()[&1]);
-        assert_ne!(overlay.get_pixel(30, 18), &scene().colours()[&1]);
-    }
-
-    #[test]
-    fn an_object_outside_the_image_does_no_harm() {
-        let mut scene = scene();
-        (scene.objects[0].0.x, scene.objects[0].0.y) = (-3.0, 9.0);
-        scene.objects[0].0.width = f32::NAN;
-        assert_eq!(scene.overlay(2).dimensions(), (32, 32));
+        assert_eq!(background(&scene), [0.0, 0.0, 1.0, 0.5]);
     }
 
     #[test]

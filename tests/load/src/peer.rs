@@ -5,6 +5,7 @@
 
 use anyhow::{Result, ensure};
 use base64::{Engine as _, engine::general_purpose::STANDARD};
+use clap::ValueEnum;
 use reqwest::{Client, Response};
 use serde_json::{Value, json};
 
@@ -14,7 +15,7 @@ use crate::robot::picture;
 const SIDE: u32 = 64;
 
 /// Which server.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, ValueEnum)]
 pub(crate) enum PeerKind {
     /// The session's number in 16 digits before the body, as bytes.
     Mosec,

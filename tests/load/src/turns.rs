@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, bail};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use futures_util::future::try_join_all;
 use tokio::time::Instant;
 
@@ -18,23 +18,15 @@ use crate::{
 
 #[derive(Args)]
 pub(crate) struct Arguments {
-    /// What serves
-    #[arg(long, value_enum, default_value = "gatsbi")]
-    kind: Kind,
+    /// Which other server it is
+    #[arg(long, value_enum)]
+    peer: Option<PeerKind>,
     /// Where: the gRPC API's address, or a peer's
     #[arg(long)]
     server: String,
     /// Numbers of an action that a peer takes
     #[arg(long, default_value_t = 7)]
     actions: usize,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Kind {
-    Gatsbi,
-    Mosec,
-    Litserve,
-    Triton,
 }
 
 /// Whoever observes.
@@ -45,16 +37,11 @@ enum Observer {
 
 impl Arguments {
     async fn observer(&self, number: u64, stream: bool) -> Result<Observer> {
-        let kind = match self.kind {
-            Kind::Gatsbi => {
-                let robot = Service::connect(&self.server).await?.robot(number, stream).await?;
-                return Ok(Observer::Robot(Box::new(robot)));
-            }
-            Kind::Mosec => PeerKind::Mosec,
-            Kind::Litserve => PeerKind::Litserve,
-            Kind::Triton => PeerKind::Triton,
-        };
-        Ok(Observer::Peer(Peer::new(kind, &self.server, number, self.actions)))
+        if let Some(kind) = self.peer {
+            return Ok(Observer::Peer(Peer::new(kind, &self.server, number, self.actions)));
+        }
+        let service = Service::connect(&self.server).await?;
+        Ok(Observer::Robot(Box::new(service.robot(number, stream).await?)))
     }
 }
 

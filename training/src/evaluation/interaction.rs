@@ -95,10 +95,10 @@ impl Followed {
 
 #[cfg(test)]
 mod tests {
-    use gatsbi_models::scene::ObjectTable;
-    use tch::{Device, Kind};
-
-    use super::*;
+    use super::{
+        super::samples::{labels, scene},
+        *,
+    };
 
     #[test]
     fn an_object_counts_as_touched_from_its_contact_on() {
@@ -108,21 +108,8 @@ mod tests {
             agent: vec![0; 6],
             between: vec![0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0],
         };
-        let labels = Tensor::zeros([64, 64], (Kind::Int64, Device::Cpu));
-        for (label, left) in [(2, 8), (3, 40)] {
-            let _ = labels.narrow(0, 30, 4).narrow(1, left, 4).fill_(label);
-        }
         // Found 3 pixels to the right of object 0, and where object 1 is.
-        let x = |pixel: f64| (pixel + 0.5) * 2.0 / 64.0 - 1.0;
-        let row = |pixel: f64| [1.0, x(pixel), x(31.5), 0.1, 0.1, 0.0];
-        let values = [row(12.5), row(41.5)].concat();
-        let scene = Scene {
-            objects: Some(ObjectTable {
-                ids: Tensor::from_slice(&[7i64, 9]).view([1, 2]),
-                values: Tensor::from_slice(&values).to_kind(Kind::Float).view([1, 2, 6]),
-            }),
-            ..Scene::default()
-        };
+        let (scene, labels) = (scene([12.5, 41.5]), labels([8, 40]));
         let mut followed = Followed::new(&[(2, 7), (3, 9)]);
         let mut step = |t| followed.step(t, &contacts, &scene, &labels, 0);
         let near = |found: &[f64], expected: &[f64]| {

@@ -8,6 +8,8 @@ pub mod perceptual;
 pub mod picture;
 pub mod plot;
 pub mod report;
+#[cfg(test)]
+mod samples;
 pub mod statistics;
 
 use anyhow::Context as _;

@@ -57,7 +57,7 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
     server.args(["--threads", "2", "--observe-block", "16", "--checkpoint"]).arg(&place.checkpoint);
     let log = tools.folder.path().join("server.log");
     let server = Server::start(&mut server, &log, &tools.interrupt)?;
-    let mut ours = load(tools, OURS, &server.grpc)?;
+    let mut ours = load(tools, None, &server.grpc)?;
     let mut peers = BTreeMap::new();
     for name in PEERS {
         progress(&format!("starting {name}"));
@@ -171,7 +171,7 @@ impl Place {
         let began = Instant::now();
         loop {
             tools.interrupt.check()?;
-            let mut load = load(tools, name, &url)?;
+            let mut load = load(tools, Some(name), &url)?;
             match load.ask("observe 1 0") {
                 Ok(_) => return Ok(Peer { load, process: Some(process) }),
                 Err(error) if began.elapsed() > PATIENCE || process.child.try_wait()?.is_some() => {
@@ -237,9 +237,13 @@ fn make(venv: &Path, sources: &Path) -> Result<()> {
     Ok(())
 }
 
-fn load(tools: &Tools<'_>, kind: &str, url: &str) -> Result<Side> {
+/// Loads a peer, or the service where none is named.
+fn load(tools: &Tools<'_>, peer: Option<&str>, url: &str) -> Result<Side> {
     let mut command = Command::new(tools.programs.named("gatsbi-load")?);
-    command.args(["turns", "--kind", kind, "--server", url]).stderr(Stdio::null());
+    command.args(["turns", "--server", url]).stderr(Stdio::null());
+    if let Some(peer) = peer {
+        command.args(["--peer", peer]);
+    }
     Side::start("the load", &mut command)
 }
 

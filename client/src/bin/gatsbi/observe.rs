@@ -11,6 +11,7 @@ use gatsbi_client::{
     Belief, Encoding, Image, Observation, Output, Selection, Session, SessionInfo,
 };
 use gatsbi_episodes::exchange::McapWriter;
+use gatsbi_pictures::enlarge;
 use image::RgbImage;
 use serde_json::json;
 
@@ -18,10 +19,9 @@ use crate::{
     Shared,
     failure::{Misuse, misuse},
     models::short,
-    picture::enlarge,
     picture::{
         ENLARGED, image,
-        scene::{Scene, cut_out},
+        scene::{cut_out, scene},
         sheet::{Row, Sheet, Tile},
     },
     print::{self, bar, print, print_json, table},
@@ -269,11 +269,11 @@ fn picture(belief: &Belief, sent: Option<RgbImage>, folder: &Path) -> anyhow::Re
     }
     tiles.push(Tile::new(enlarge(&frame, ENLARGED), &["rebuilt by the model"]));
     let ground = camera.unwrap_or(frame);
-    let scene = Scene::new(ground, outputs.array(Output::AgentMask), masks, &belief.objects);
+    let scene = scene(ground, outputs.array(Output::AgentMask), masks, &belief.objects);
     if let Some(agent) = &scene.agent {
-        tiles.push(Tile::new(enlarge(&cut_out(&scene.frame, agent), ENLARGED), &["agent"]));
+        tiles.push(Tile::new(enlarge(&cut_out(&scene.picture, agent), ENLARGED), &["agent"]));
     }
-    tiles.push(Tile::new(enlarge(&scene.objects(), ENLARGED), &["objects"]));
+    tiles.push(Tile::new(enlarge(&scene.objects_alone(), ENLARGED), &["objects"]));
     tiles.push(Tile::new(scene.overlay(ENLARGED), &["overlay: boxes with ids"]));
     let title = format!("step {}", belief.step);
     let sheet = Sheet { title, rows: vec![Row { heading: String::new(), tiles }] };

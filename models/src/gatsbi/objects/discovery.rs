@@ -86,7 +86,7 @@ impl Discovery {
     }
 
     /// # Shapes
-    /// `input [B, 6, H, W]` (the frame and its difference to `mu_mix`), `propagated [B, N, Z]`.
+    /// `input [B, 6, H, W]` is [`input`], `propagated [B, N, Z]`.
     pub(crate) fn posterior(
         &self,
         input: &Tensor,
@@ -165,6 +165,11 @@ impl Discovery {
     pub(crate) fn freeze(&mut self) {
         self.image_encoder.freeze();
     }
+}
+
+/// What discovery sees: a frame `[B, 3, H, W]` and its difference to `mu_mix`, `[B, 6, H, W]`.
+pub(crate) fn input(frame: &Tensor, mu_mix: &Tensor) -> Tensor {
+    Tensor::cat(&[frame, &(frame - mu_mix)], 1)
 }
 
 /// Candidates at `z_where [B, G², 4]` that overlap a present propagated object more than `threshold`,

@@ -198,8 +198,7 @@ impl ObjectModule {
             }
         };
         let discovered = (!matches!(discover, Discover::None)).then(|| {
-            let difference = scenery.frame - scenery.residual_mix;
-            let input = Tensor::cat(&[scenery.frame, &difference], 1);
+            let input = discovery::input(scenery.frame, scenery.residual_mix);
             self.discovery.posterior(&input, &propagated.z, noise, train)
         });
         let tracked = Tracked { post, prior };
@@ -274,10 +273,9 @@ impl ObjectModule {
     /// present ones are objects.
     pub fn detect(&self, frame: &Tensor, mu_mix: &Tensor) -> Tensor {
         let batch = frame.size()[0];
-        let input = Tensor::cat(&[frame, &(frame - mu_mix)], 1);
         let nothing = self.initial_state(batch).z;
         let noise = PhiloxNoise::mean(batch, frame.device());
-        self.discovery.posterior(&input, &nothing, &noise, false).z
+        self.discovery.posterior(&discovery::input(frame, mu_mix), &nothing, &noise, false).z
     }
 
     /// Centres x, y in [-1, 1] of what is drawn in the boxes of objects `z [B, N, Z]`, `[B, N, 2]`: a box need not be

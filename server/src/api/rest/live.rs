@@ -23,6 +23,7 @@ use base64::{Engine as _, prelude::BASE64_STANDARD};
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _, stream::unfold};
 use gatsbi_models::scene::Output;
+use gatsbi_pictures::scene::PRESENT;
 use gatsbi_proto::v1;
 use serde::Deserialize;
 use serde_json::{Value as Json, json};
@@ -36,7 +37,7 @@ use crate::{
     media,
     pictures::{
         self, byte,
-        scene::{self, Of, PRESENT},
+        scene::{self, Of},
     },
     service::{
         Service, aside,

@@ -11,6 +11,7 @@ use axum::{
 };
 use bytes::Bytes;
 use gatsbi_models::world_model::ModelSpec;
+use gatsbi_pictures::enlarge;
 use gatsbi_proto::v1;
 use serde::Deserialize;
 
@@ -19,9 +20,9 @@ use crate::{
     api::call::Of as Called,
     error::Error,
     pictures::{
-        self, enlarge,
+        self,
         rollout::Pictures,
-        scene::{self, Of, Scene},
+        scene::{self, Of},
     },
     planning::noise::Draws,
     service::{Call, Service, aside},
@@ -109,7 +110,7 @@ async fn overlay(
         Ok((service.shown(&id).await?, of, scale))
     });
     let (shown, of, scale) = answer.await?;
-    painted(move || pictures::png(&Scene::new(&shown, of).overlay(scale))).await
+    painted(move || pictures::png(&scene::scene(&shown, of).overlay(scale))).await
 }
 
 async fn masks(
@@ -125,7 +126,7 @@ async fn masks(
         Ok((service.shown(&id).await?, scale))
     });
     let (shown, scale) = answer.await?;
-    painted(move || pictures::png(&Scene::masks(&shown, scale))).await
+    painted(move || pictures::png(&scene::masks(&shown, scale))).await
 }
 
 async fn strip(

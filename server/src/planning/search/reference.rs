@@ -1,9 +1,9 @@
 //! Our searches beside public ones: mbrl-lib's CEM and iCEM and pytorch-mppi's MPPI, as `tests/planners/record.py` saw
 //! them run.
 //!
-//! Given the samples that they drew and what those cost, ours must come to the same distribution. Drawing for itself, it
-//! must find plans that are no worse than most of theirs. Where the libraries differ from the papers that ours follow, the difference is
-//! taken out here, and named.
+//! Given the samples that they drew and what those cost, ours must come to the same distribution. Drawing for itself,
+//! it must find plans that are no worse than most of theirs. Where the libraries differ from the papers that ours
+//! follow, the difference is taken out here, and named.
 
 use std::iter::zip;
 

@@ -4,6 +4,10 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
 use gatsbi_client::{Array, Output};
+use gatsbi_pictures::{
+    enlarge,
+    scene::{Scene, grey},
+};
 use image::RgbImage;
 
 use super::{
@@ -11,8 +15,8 @@ use super::{
     measure::{Errors, labels, psnr},
 };
 use crate::picture::{
-    ENLARGED, enlarge, image,
-    scene::{Scene, cut_out, grey, labelled},
+    ENLARGED, image,
+    scene::{cut_out, labelled, scene},
     sheet::{self, Row, Sheet, Tile},
 };
 
@@ -47,16 +51,16 @@ fn observed_sheet(story: &Story) -> anyhow::Result<Sheet> {
         let scene = observed(story, t)?;
         let frame = output(belief, Output::Frame)?;
         let rebuilt = image(frame).context("no RGB image came")?;
-        let (width, height) = scene.frame.dimensions();
+        let (width, height) = scene.picture.dimensions();
         let agent = match &scene.agent {
-            Some(mask) => cut_out(&scene.frame, mask),
+            Some(mask) => cut_out(&scene.picture, mask),
             None => RgbImage::new(width, height),
         };
         let pictures = [
-            enlarge(&scene.frame, ENLARGED),
+            enlarge(&scene.picture, ENLARGED),
             enlarge(&rebuilt, ENLARGED),
             enlarge(&agent, ENLARGED),
-            enlarge(&scene.objects(), ENLARGED),
+            enlarge(&scene.objects_alone(), ENLARGED),
             scene.overlay(ENLARGED),
         ];
         let labels = labels(&story.recording, t)
@@ -74,7 +78,7 @@ fn observed_sheet(story: &Story) -> anyhow::Result<Sheet> {
 fn decomposed_sheet(story: &Story) -> anyhow::Result<Sheet> {
     let t = story.beliefs.len() - 1;
     let (belief, scene) = (&story.beliefs[t], observed(story, t)?);
-    let size = scene.frame.dimensions();
+    let size = scene.picture.dimensions();
     let tile =
         |picture: &RgbImage, caption: &[&str]| Tile::new(enlarge(picture, ENLARGED), caption);
 
@@ -82,7 +86,7 @@ fn decomposed_sheet(story: &Story) -> anyhow::Result<Sheet> {
     let whole = Row {
         heading: "the whole".to_owned(),
         tiles: vec![
-            tile(&scene.frame, &["camera"]),
+            tile(&scene.picture, &["camera"]),
             tile(&rgb(Output::Frame)?, &["rebuilt by the model"]),
             tile(&rgb(Output::Background)?, &["background: without agent", "and objects"]),
             Tile::new(scene.overlay(ENLARGED), &["overlay"]),
@@ -101,9 +105,11 @@ fn decomposed_sheet(story: &Story) -> anyhow::Result<Sheet> {
         tiles: slots.collect(),
     };
     let objects = scene.objects.iter().map(|(object, mask)| {
-        let name = format!("object {} at {:.0}, {:.0}", object.id, object.pixel_x, object.pixel_y);
+        let pixel = |x: f32, side: u32| (x + 1.0) * (side as f32 / 2.0) - 0.5;
+        let (x, y) = (pixel(object.x, size.0), pixel(object.y, size.1));
+        let name = format!("object {} at {x:.0}, {y:.0}", object.id);
         let more = format!("presence {:.2}", object.presence);
-        tile(&cut_out(&scene.frame, mask), &[&name, &more])
+        tile(&cut_out(&scene.picture, mask), &[&name, &more])
     });
     let mut rows = vec![whole, slots];
     let objects: Vec<Tile> = objects.collect();
@@ -154,7 +160,7 @@ fn imagined_sheet(story: &Story, errors: &Errors) -> anyhow::Result<Sheet> {
         let mut row = Row { heading, tiles: vec![now()?] };
         for &at in &columns {
             let scene = imagined(story, number, at)?;
-            let mut tile = Tile::new(scene.boxed(&scene.frame, ENLARGED), &[&step(at)]);
+            let mut tile = Tile::new(scene.boxed(&scene.picture, ENLARGED), &[&step(at)]);
             if number == 0 {
                 tile.caption.push(format!("{:.1} dB", psnr(errors.steps[at].imagined)));
             }
@@ -175,7 +181,7 @@ fn observed(story: &Story, t: usize) -> anyhow::Result<Scene> {
     let belief = &story.beliefs[t];
     let masks = output(belief, Output::ObjectMasks)?;
     let agent = belief.outputs.array(Output::AgentMask);
-    Ok(Scene::new(frame(story, t)?, agent, masks, &belief.objects))
+    Ok(scene(frame(story, t)?, agent, masks, &belief.objects))
 }
 
 fn imagined(story: &Story, candidate: usize, at: usize) -> anyhow::Result<Scene> {
@@ -185,7 +191,7 @@ fn imagined(story: &Story, candidate: usize, at: usize) -> anyhow::Result<Scene>
     let masks = part(Output::ObjectMasks).context("no imagined object masks came")?;
     let tracks = outputs.tracks().context("no imagined objects came")?;
     let objects = tracks.objects(&[0, candidate, at]);
-    Ok(Scene::new(frame, part(Output::AgentMask).as_ref(), &masks, &objects))
+    Ok(scene(frame, part(Output::AgentMask).as_ref(), &masks, &objects))
 }
 
 /// The recorded frame `t`.

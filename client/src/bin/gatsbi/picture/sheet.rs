@@ -3,13 +3,11 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use embedded_graphics::mono_font::{
-    MonoFont,
-    ascii::{FONT_6X13, FONT_6X13_BOLD, FONT_8X13_BOLD},
+use gatsbi_pictures::canvas::{
+    Canvas, MonoFont,
+    font::{FONT_6X13, FONT_6X13_BOLD, FONT_8X13_BOLD},
 };
 use image::{Rgb, RgbImage};
-
-use super::canvas::Canvas;
 
 const PAPER: Rgb<u8> = Rgb([255; 3]);
 const INK: Rgb<u8> = Rgb([30; 3]);

@@ -6,7 +6,7 @@ use embedded_graphics::{
     Pixel,
     draw_target::DrawTarget,
     geometry::{OriginDimensions, Point, Size},
-    mono_font::{MonoFont, MonoTextStyleBuilder},
+    mono_font::MonoTextStyleBuilder,
     pixelcolor::{Rgb888, RgbColor as _},
     prelude::Primitive as _,
     primitives::{PrimitiveStyle, Rectangle},
@@ -14,28 +14,32 @@ use embedded_graphics::{
 };
 use image::{Rgb, RgbImage};
 
+pub use embedded_graphics::mono_font::{MonoFont, ascii as font};
+
 /// A picture to draw on; what lies outside is cut off.
-pub(crate) struct Canvas(pub(crate) RgbImage);
+#[derive(Debug)]
+pub struct Canvas(pub RgbImage);
 
 impl Canvas {
-    pub(crate) fn blank(width: u32, height: u32, colour: Rgb<u8>) -> Self {
+    /// One colour.
+    pub fn blank(width: u32, height: u32, colour: Rgb<u8>) -> Self {
         Self(RgbImage::from_pixel(width, height, colour))
     }
 
     /// Lays a picture with its upper left corner at `(x, y)`.
-    pub(crate) fn lay(&mut self, picture: &RgbImage, x: u32, y: u32) {
+    pub fn lay(&mut self, picture: &RgbImage, x: u32, y: u32) {
         image::imageops::replace(&mut self.0, picture, x.into(), y.into());
     }
 
     /// The outline of a rectangle with its upper left corner at `(x, y)`, drawn inwards.
-    pub(crate) fn outline(&mut self, at: (i32, i32), size: (u32, u32), colour: Rgb<u8>) {
+    pub fn outline(&mut self, at: (i32, i32), size: (u32, u32), colour: Rgb<u8>) {
         let rectangle = Rectangle::new(Point::new(at.0, at.1), Size::new(size.0, size.1));
         let style = PrimitiveStyle::with_stroke(colour_of(colour), 1);
         drawn(embedded_graphics::Drawable::draw(&rectangle.into_styled(style), self));
     }
 
     /// Letters with their upper left corner at `(x, y)`, on a ground of their own if one is given.
-    pub(crate) fn text(
+    pub fn text(
         &mut self,
         at: (i32, i32),
         text: &str,
@@ -86,9 +90,7 @@ fn drawn(result: Result<(), Infallible>) {
 
 #[cfg(test)]
 mod tests {
-    use embedded_graphics::mono_font::ascii::FONT_6X10;
-
-    use super::*;
+    use super::{font::FONT_6X10, *};
 
     #[test]
     fn what_lies_outside_is_cut_off() {

@@ -1,4 +1,4 @@
-//! Colours of the agent and of objects, which the page and the command line have too.
+//! Colours of the agent and of objects, which the page has too.
 //!
 //! The rule: of the objects in one picture, from the lowest id to the highest, each takes the colour at its id modulo
 //! the palette's size, or the next one that is free; when all are taken, all are free again. So objects that are seen
