@@ -12,6 +12,7 @@
 pub mod checkpoint;
 pub mod config;
 pub mod gatsbi;
+pub mod idle;
 mod kernels;
 pub mod nn;
 pub mod noise;

@@ -11,6 +11,7 @@ use gatsbi_models::{
         objects::Discover,
         world::GatsbiWorld,
     },
+    idle::asking_for,
     nn::count_macs,
     noise::{PhiloxNoise, RowNoise},
     scene::{Output, Outputs},
@@ -89,6 +90,26 @@ fn rows_do_not_depend_on_each_other() {
     assert!(floats < 1e-4, "{floats}");
     assert_eq!(together.ints.get(1), alone.ints.get(0));
     assert!(largest_difference(&frames.get(1), &frame.get(0)) < 1e-4);
+}
+
+#[test]
+fn rows_that_nobody_asks_for_change_no_other() {
+    for config in [presets::tiny(), presets::push1()] {
+        let world = world(config);
+        let _no_grad = tch::no_grad_guard();
+        let rows = [(0.7, 2), (0.7, 2), (1.9, 3), (0.7, 2), (2.3, 4)];
+        let ((all, frames), macs) = count_macs(|| run(&world, &rows));
+        let asked = [false, true, true, false, true];
+        let ((some, less), fewer) = count_macs(|| asking_for(&asked, || run(&world, &rows)));
+        assert!(fewer < macs * 8 / 10, "{fewer} of {macs}");
+        for row in [1, 2, 4] {
+            for (all, some) in
+                [(&all.floats, &some.floats), (&all.ints, &some.ints), (&frames, &less)]
+            {
+                assert_eq!(all.get(row), some.get(row));
+            }
+        }
+    }
 }
 
 #[test]

@@ -251,7 +251,6 @@ impl Stack {
     /// `[N, channels, side, side]` or, for vectors, `[N, channels]`; returns `[N, channels', side', side']`.
     pub(crate) fn forward(&self, x: &Tensor) -> Tensor {
         let images = x.size()[0];
-        macs::add(images as usize * self.macs);
         let x = x.contiguous();
         let [first, last] = [self.shapes[0], self.shapes[self.layers.len()]];
         let size = |shape: Shape| shape.side * shape.side * shape.channels;
@@ -260,14 +259,16 @@ impl Stack {
         let input = tensor::numbers(&x);
         let output_image = size(last);
         let output_numbers = tensor::numbers_mut(&mut output);
-        for_runs(images as usize, TOGETHER, (output_numbers, output_image), |start, output| {
-            let pool = || self.rooms.lock().unwrap_or_else(PoisonError::into_inner);
-            let taken = pool().pop();
-            let mut rooms = taken.unwrap_or_else(|| self.rooms());
-            let images = output.len() / output_image;
-            self.run(images, &input[start * size(first)..], output, &mut rooms);
-            pool().push(rooms);
-        });
+        let computed =
+            for_runs(images as usize, TOGETHER, (output_numbers, output_image), |start, output| {
+                let pool = || self.rooms.lock().unwrap_or_else(PoisonError::into_inner);
+                let taken = pool().pop();
+                let mut rooms = taken.unwrap_or_else(|| self.rooms());
+                let images = output.len() / output_image;
+                self.run(images, &input[start * size(first)..], output, &mut rooms);
+                pool().push(rooms);
+            });
+        macs::add(computed * self.macs);
         output
     }
 

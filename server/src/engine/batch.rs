@@ -11,6 +11,7 @@ use std::{
 
 use bytes::Bytes;
 use gatsbi_models::{
+    idle::asking_for,
     noise::{PhiloxNoise, RowNoise},
     scene::{Output, Outputs, Scene},
     state::{State, StateRow},
@@ -32,7 +33,8 @@ pub(super) struct Batch {
     actions: Vec<f32>,
     noise: Vec<RowNoise>,
     wanted: Vec<Wanted>,
-    rows: usize,
+    /// Lanes that are taken.
+    taken: Vec<bool>,
     imagine: bool,
 }
 
@@ -64,7 +66,7 @@ impl Batch {
             actions: padded.iter().flat_map(|observe| &observe.action).copied().collect(),
             noise: padded.iter().map(|observe| observe.noise).collect(),
             wanted: lanes.iter().flatten().map(|observe| observe.wanted).collect(),
-            rows: lanes.iter().flatten().count(),
+            taken: lanes.iter().map(Option::is_some).collect(),
             imagine: false,
         }
     }
@@ -81,14 +83,14 @@ impl Batch {
             actions: actions.copied().collect(),
             noise: padded.iter().map(|(job, step)| job.noise(step.row, step.depth)).collect(),
             wanted: wanted.map(|(job, _)| job.wanted).collect(),
-            rows: lanes.iter().flatten().count(),
+            taken: lanes.iter().map(Option::is_some).collect(),
             imagine: true,
         }
     }
 
     /// Rows that are not padding.
     pub(super) fn rows(&self) -> usize {
-        self.rows
+        self.taken.iter().filter(|taken| **taken).count()
     }
 }
 
@@ -154,7 +156,8 @@ impl Computed {
 
 /// Runs a batch through the model; a panic in there comes back as its message.
 pub(super) fn compute(world: &dyn WorldModel, batch: Batch) -> Result<Computed, String> {
-    catch_unwind(AssertUnwindSafe(|| step(world, batch))).map_err(|panic| {
+    let taken = batch.taken.clone();
+    catch_unwind(AssertUnwindSafe(|| asking_for(&taken, || step(world, batch)))).map_err(|panic| {
         let text = panic.downcast_ref::<String>().map(String::as_str);
         text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()
     })

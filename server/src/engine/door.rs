@@ -189,8 +189,8 @@ impl Door {
     }
 
     /// Remembers what a block cost.
-    pub(super) fn measured(&self, cost: &Cost, elapsed: Duration) {
-        cost.measured(elapsed);
+    pub(super) fn measured(&self, cost: &Cost, rows: usize, elapsed: Duration) {
+        cost.measured(rows, elapsed);
         *self.measured.lock() = Instant::now();
     }
 
@@ -227,13 +227,15 @@ impl Door {
     }
 
     fn observe_cost(&self, costs: &Costs) -> Duration {
-        costs.observe.get() / self.sizes.observe_block as u32
+        costs.observe.full() / self.sizes.observe_block as u32
     }
 
     fn rollout_cost(&self, costs: &Costs, load: Load) -> Duration {
-        let blocks = u64::from(load.rows).div_ceil(self.sizes.imagine_block as u64);
-        let blocks = blocks * u64::from(load.steps);
-        costs.imagine.get().saturating_mul(u32::try_from(blocks).unwrap_or(u32::MAX))
+        let (rows, lanes) = (load.rows as usize, self.sizes.imagine_block);
+        let full = costs.imagine.full().saturating_mul((rows / lanes) as u32);
+        let rest = rows % lanes;
+        let rest = if rest > 0 { costs.imagine.of(rest) } else { Duration::ZERO };
+        full.saturating_add(rest).saturating_mul(load.steps)
     }
 
     fn ticket(
@@ -310,7 +312,10 @@ mod tests {
     fn door(observes: usize) -> (Arc<Door>, Costs) {
         let door = DoorSizes { observes, rows: 10, output_bytes: 8 << 10 };
         let sizes = Sizes { observe_block: 1, imagine_block: 4, slots: 8 };
-        let costs = Costs { observe: Cost::new(millis(5)), imagine: Cost::new(millis(8)) };
+        let costs = Costs {
+            observe: Cost::new(millis(5), millis(5), 1),
+            imagine: Cost::new(millis(8), millis(8), 4),
+        };
         (Arc::new(Door::new(door, sizes)), costs)
     }
 
@@ -384,12 +389,15 @@ mod tests {
         let (bulk, _outputs) = door.admit_bulk_rollout(&costs, load(5, 1, 1)).await.unwrap();
         let waiting = tokio::spawn({
             let (door, costs) =
-                (Arc::clone(&door), Costs { observe: Cost::new(millis(5)), ..costs });
+                (Arc::clone(&door), Costs { observe: Cost::new(millis(5), millis(5), 1), ..costs });
             async move { door.admit_bulk_rollout(&costs, load(1, 1, 1)).await.map(drop) }
         });
         tokio::task::yield_now().await;
         assert!(!waiting.is_finished());
-        let costs = Costs { observe: Cost::new(millis(5)), imagine: Cost::new(millis(8)) };
+        let costs = Costs {
+            observe: Cost::new(millis(5), millis(5), 1),
+            imagine: Cost::new(millis(8), millis(8), 4),
+        };
         drop(door.admit_rollout(&costs, load(10, 1, 1)).unwrap());
         drop(bulk);
         waiting.await.unwrap().unwrap();

@@ -13,6 +13,7 @@ use std::{
 };
 
 use gatsbi_models::{
+    idle::asking_for,
     noise::PhiloxNoise,
     scene::Outputs,
     state::StateRow,
@@ -91,25 +92,47 @@ pub(super) struct Costs {
     pub(super) imagine: Cost,
 }
 
-/// A cost that follows its measurements: an eighth of the way each time, and never by more than a factor of two, so
-/// that a hiccup of the machine does not turn requests away for long.
+/// A block's cost, which grows evenly from that of a single row to that of a full block. Its scale follows what is
+/// measured: an eighth of the way each time, and never by more than a factor of two, so that a hiccup of the machine
+/// does not turn requests away for long.
 #[derive(Debug)]
-pub(super) struct Cost(AtomicU64);
+pub(super) struct Cost {
+    /// Nanoseconds of a full block.
+    full: AtomicU64,
+    /// A single row's cost over a full block's.
+    one: f64,
+    lanes: usize,
+}
 
 impl Cost {
-    pub(super) fn new(first: Duration) -> Self {
-        Self(AtomicU64::new((first.as_nanos() as u64).max(1)))
+    /// From what a single row and a full block of so many took.
+    pub(super) fn new(one: Duration, full: Duration, lanes: usize) -> Self {
+        let full = (full.as_nanos() as u64).max(1);
+        let one = (one.as_nanos() as f64 / full as f64).min(1.0);
+        Self { full: AtomicU64::new(full), one, lanes }
     }
 
-    pub(super) fn get(&self) -> Duration {
-        Duration::from_nanos(self.0.load(Ordering::Relaxed))
+    /// Of a full block.
+    pub(super) fn full(&self) -> Duration {
+        Duration::from_nanos(self.full.load(Ordering::Relaxed))
+    }
+
+    /// Of a block with so many rows.
+    pub(super) fn of(&self, rows: usize) -> Duration {
+        self.full().mul_f64(self.share(rows))
+    }
+
+    fn share(&self, rows: usize) -> f64 {
+        let others = self.lanes.saturating_sub(1).max(1) as f64;
+        self.one + (1.0 - self.one) * (rows.saturating_sub(1) as f64 / others)
     }
 
     /// Only the model's thread measures.
-    pub(super) fn measured(&self, cost: Duration) {
-        let old = self.0.load(Ordering::Relaxed);
-        let new = (cost.as_nanos() as u64).clamp(old / 2, old * 2);
-        self.0.store(((old * 7 + new) / 8).max(1), Ordering::Relaxed);
+    pub(super) fn measured(&self, rows: usize, cost: Duration) {
+        let old = self.full.load(Ordering::Relaxed);
+        let full = (cost.as_nanos() as f64 / self.share(rows)) as u64;
+        let new = full.clamp(old / 2, old * 2);
+        self.full.store(((old * 7 + new) / 8).max(1), Ordering::Relaxed);
     }
 }
 
@@ -163,19 +186,27 @@ pub(super) fn warm_up(world: &dyn WorldModel, sizes: Sizes) -> Result<Costs, Str
             let (state, _) = world.imagine(&state, &actions(imagined), &noise, Outputs::default());
             state.to_rows();
         };
+        let cost = |lanes: i64, step: &dyn Fn()| {
+            let asked: Vec<bool> = (0..lanes).map(|lane| lane == 0).collect();
+            let one = timed(|| asking_for(&asked, step));
+            Cost::new(one, timed(step), lanes as usize)
+        };
         observe(Some(&frames));
         observe(None);
         imagine();
-        Costs { observe: timed(|| observe(Some(&frames))), imagine: timed(imagine) }
+        Costs {
+            observe: cost(observed, &|| observe(Some(&frames))),
+            imagine: cost(imagined, &imagine),
+        }
     };
     let panicked = || format!("{} panicked in its first steps", world.spec().name);
     catch_unwind(AssertUnwindSafe(steps)).ok().ok_or_else(panicked)
 }
 
-fn timed(step: impl FnOnce()) -> Cost {
+fn timed(step: impl FnOnce()) -> Duration {
     let began = Instant::now();
     step();
-    Cost::new(began.elapsed())
+    began.elapsed()
 }
 
 /// A model that nobody serves, for tests of what only holds on to one: images of 2 x 2 pixels, no action, and
@@ -198,7 +229,7 @@ pub(crate) fn made_up(hash: &str, floats: usize, ints: usize) -> Arc<ModelEntry>
         provenance: String::new(),
     };
     let initial = StateRow { floats: vec![0.0; floats].into(), ints: vec![0; ints].into() };
-    let cost = || Cost::new(Duration::from_millis(1));
+    let cost = || Cost::new(Duration::from_millis(1), Duration::from_millis(1), 1);
     Arc::new(ModelEntry {
         id: ModelId(0),
         spec,
@@ -218,16 +249,31 @@ mod tests {
     #[test]
     fn a_cost_follows_what_lasts_and_not_a_hiccup() {
         let millis = Duration::from_millis;
-        let cost = Cost::new(millis(16));
-        cost.measured(Duration::from_secs(10));
-        assert_eq!(cost.get(), millis(18));
+        let cost = Cost::new(millis(16), millis(16), 1);
+        cost.measured(1, Duration::from_secs(10));
+        assert_eq!(cost.full(), millis(18));
         for _ in 0..100 {
-            cost.measured(millis(40));
+            cost.measured(1, millis(40));
         }
-        assert!(cost.get() > millis(39) && cost.get() <= millis(40));
+        assert!(cost.full() > millis(39) && cost.full() <= millis(40));
         for _ in 0..100 {
-            cost.measured(millis(8));
+            cost.measured(1, millis(8));
         }
-        assert!(cost.get() >= millis(8) && cost.get() < millis(9));
+        assert!(cost.full() >= millis(8) && cost.full() < millis(9));
+    }
+
+    #[test]
+    fn rows_of_a_block_cost_the_same_whoever_measures() {
+        let millis = Duration::from_millis;
+        let cost = Cost::new(millis(4), millis(16), 4);
+        assert_eq!([1, 2, 3, 4].map(|rows| cost.of(rows)), [4, 8, 12, 16].map(millis));
+        for rows in [1, 2, 3, 4] {
+            cost.measured(rows, cost.of(rows));
+        }
+        assert_eq!(cost.full(), millis(16));
+        for _ in 0..100 {
+            cost.measured(2, millis(4));
+        }
+        assert!(cost.full() >= millis(8) && cost.full() < millis(9));
     }
 }

@@ -92,7 +92,7 @@ impl Served {
     /// What is to be computed next, with rollouts in about `time`.
     pub(super) fn next_tick(&mut self, time: std::time::Duration) -> Tick {
         self.forget_the_gone();
-        let block = self.entry.upgrade().map(|entry| entry.costs.imagine.get().as_nanos());
+        let block = self.entry.upgrade().map(|entry| entry.costs.imagine.full().as_nanos());
         let blocks = (time.as_nanos() / block.unwrap_or(u128::MAX)).clamp(1, 64) as usize;
         let mut tick = self.scheduler.tick(Instant::now(), blocks);
         for job in std::mem::take(&mut tick.expired) {
@@ -140,7 +140,7 @@ impl Served {
         let elapsed = started.elapsed();
         self.metrics.batch(Kind::Observe, rows, block.len(), elapsed);
         self.door.gauges.block(Kind::Observe, rows, block.len(), elapsed);
-        self.measured(Kind::Observe, elapsed);
+        self.measured(Kind::Observe, rows, elapsed);
         let computed = match result {
             Ok(computed) => computed,
             Err(panic) => return self.isolate(block, &panic, |job| *job, Self::observe),
@@ -190,7 +190,7 @@ impl Served {
         let elapsed = started.elapsed();
         self.metrics.batch(Kind::Imagine, rows, block.len(), elapsed);
         self.door.gauges.block(Kind::Imagine, rows, block.len(), elapsed);
-        self.measured(Kind::Imagine, elapsed);
+        self.measured(Kind::Imagine, rows, elapsed);
         let computed = match result {
             Ok(computed) => computed,
             Err(panic) => return self.isolate(&block, &panic, |step| step.job, Self::imagine),
@@ -206,13 +206,13 @@ impl Served {
         self.deliver(&block, &computed, started);
     }
 
-    fn measured(&self, kind: Kind, elapsed: std::time::Duration) {
+    fn measured(&self, kind: Kind, rows: usize, elapsed: std::time::Duration) {
         let Some(entry) = self.entry.upgrade() else { return };
         let cost = match kind {
             Kind::Observe => &entry.costs.observe,
             Kind::Imagine => &entry.costs.imagine,
         };
-        self.door.measured(cost, elapsed);
+        self.door.measured(cost, rows, elapsed);
     }
 
     /// Brings the pinned beliefs of rows that start into their slots.
