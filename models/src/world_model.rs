@@ -13,7 +13,7 @@ use crate::{
 ///
 /// Steps are pure functions of their arguments: no hidden state, no global random numbers, no shape that
 /// depends on data, and no row of a batch depends on another.
-pub trait WorldModel: Send {
+pub trait WorldModel: Send + Sync {
     /// What the model takes and gives.
     fn spec(&self) -> &ModelSpec;
 

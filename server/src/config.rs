@@ -107,6 +107,11 @@ pub struct Config {
     #[arg(long, env = "GATSBI_TENANT_MAX_KEPT_MIB", value_name = "N", help_heading = "Access")]
     pub tenant_max_kept_mib: Option<u64>,
 
+    /// Blocks that are computed at the same time on a CPU, each by threads of its own. Many candidates or many robots
+    /// want as many as there are idle cores; a lone robot gains nothing.
+    #[arg(long, env = "GATSBI_WORKERS", default_value_t = 1, help_heading = "Engine")]
+    pub workers: usize,
+
     /// CPU threads of one operation. More than there are idle cores makes every step slower; 0 takes half of the
     /// cores.
     #[arg(long, env = "GATSBI_THREADS", default_value_t = 0, help_heading = "Engine")]
@@ -117,7 +122,7 @@ pub struct Config {
     #[arg(long, env = "GATSBI_OBSERVE_BLOCK", default_value_t = 1, help_heading = "Engine")]
     pub observe_block: usize,
 
-    /// Rows of an imagine block; rollouts of fewer rows are padded. Changing it changes answers in their last bits.
+    /// Rows of an imagine block. Changing it changes answers in their last bits.
     #[arg(long, env = "GATSBI_IMAGINE_BLOCK", default_value_t = 8, help_heading = "Engine")]
     pub imagine_block: usize,
 
@@ -339,6 +344,7 @@ impl Config {
             "--otlp-endpoint needs a server that was built with the feature otel".to_owned(),
         );
         for (flag, value, range) in [
+            ("--workers", self.workers, 1..=1024),
             ("--threads", self.threads, 0..=1024),
             ("--observe-block", self.observe_block, 1..=1024),
             ("--imagine-block", self.imagine_block, 1..=1024),
@@ -410,6 +416,7 @@ impl Config {
     pub fn engine(&self) -> EngineConfig {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         EngineConfig {
+            workers: self.workers,
             threads: if self.threads == 0 { (cores / 2).max(1) } else { self.threads },
             sizes: Sizes {
                 observe_block: self.observe_block,

@@ -141,6 +141,11 @@ impl GatsbiWorld {
     }
 }
 
+#[expect(unsafe_code, reason = "tch lets nobody read a tensor from two threads")]
+// SAFETY: steps only read what the world holds, libtorch's tensors may be read by many threads at once, and their counts
+// of holders are atomic.
+unsafe impl Sync for GatsbiWorld {}
+
 impl WorldModel for GatsbiWorld {
     fn spec(&self) -> &ModelSpec {
         &self.spec

@@ -154,13 +154,43 @@ impl Computed {
     }
 }
 
-/// Runs a batch through the model; a panic in there comes back as its message.
-pub(super) fn compute(world: &dyn WorldModel, batch: Batch) -> Result<Computed, String> {
+/// What became of a batch, and how long it took. A panic comes back as its message.
+pub(super) struct Outcome {
+    pub(super) computed: Result<Computed, String>,
+    pub(super) started: Instant,
+    pub(super) elapsed: Duration,
+}
+
+/// Runs batches through the model, all at the same time.
+pub(super) fn compute(world: &dyn WorldModel, batches: Vec<Batch>) -> Vec<Outcome> {
+    let mut batches = batches.into_iter();
+    let Some(first) = batches.next() else { return Vec::new() };
+    let (span, threads) = (tracing::Span::current(), tch::get_num_threads());
+    std::thread::scope(|scope| {
+        let worker = |batch| {
+            // Products of matrices ask the thread that they are called on how many it may use.
+            tch::set_num_threads(threads);
+            span.in_scope(|| compute_one(world, batch))
+        };
+        let others: Vec<_> = batches.map(|batch| scope.spawn(move || worker(batch))).collect();
+        let first = compute_one(world, first);
+        let others = others.into_iter().map(|other| other.join().expect("panics are caught"));
+        std::iter::once(first).chain(others).collect()
+    })
+}
+
+fn compute_one(world: &dyn WorldModel, batch: Batch) -> Outcome {
+    let started = Instant::now();
+    let (rows, lanes) = (batch.rows(), batch.taken.len());
+    let kind = if batch.imagine { "imagine" } else { "observe" };
+    let _entered = tracing::debug_span!("batch", kind, rows, lanes).entered();
     let taken = batch.taken.clone();
-    catch_unwind(AssertUnwindSafe(|| asking_for(&taken, || step(world, batch)))).map_err(|panic| {
+    let step = || asking_for(&taken, || step(world, batch));
+    let computed = catch_unwind(AssertUnwindSafe(step)).map_err(|panic| {
         let text = panic.downcast_ref::<String>().map(String::as_str);
         text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()
-    })
+    });
+    Outcome { computed, started, elapsed: started.elapsed() }
 }
 
 fn step(world: &dyn WorldModel, batch: Batch) -> Computed {

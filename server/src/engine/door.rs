@@ -50,6 +50,8 @@ pub(super) struct Door {
     tenants: AtomicU64,
     measured: Mutex<Instant>,
     sizes: Sizes,
+    /// Blocks that are computed at once.
+    workers: u32,
     pub(super) gauges: Gauges,
 }
 
@@ -85,7 +87,7 @@ pub(super) struct Ticket {
 }
 
 impl Door {
-    pub(super) fn new(door: DoorSizes, sizes: Sizes) -> Self {
+    pub(super) fn new(door: DoorSizes, sizes: Sizes, workers: usize) -> Self {
         let room = |part: usize| {
             let share = |all: usize| (all / part).max(1);
             let semaphore = |all: usize| Arc::new(Semaphore::new(share(all)));
@@ -104,6 +106,7 @@ impl Door {
             tenants: AtomicU64::new(0),
             measured: Mutex::new(Instant::now()),
             sizes,
+            workers: workers.max(1) as u32,
             gauges: Gauges::default(),
         }
     }
@@ -133,7 +136,7 @@ impl Door {
         let Ok(permit) = Arc::clone(&self.live.observes).try_acquire_owned() else {
             return Err(overloaded("observations wait", before));
         };
-        Ok(self.ticket(1, own, true, permit))
+        Ok(self.ticket(1, own / self.workers, true, permit))
     }
 
     /// Room for an observe that is one of many; waits for it.
@@ -143,7 +146,7 @@ impl Door {
     ) -> Result<Ticket, Error> {
         let permit = Arc::clone(&self.bulk.observes).acquire_owned().await;
         let permit = permit.map_err(|_closed| Error::ShuttingDown)?;
-        Ok(self.ticket(1, self.observe_cost(costs), false, permit))
+        Ok(self.ticket(1, self.observe_cost(costs) / self.workers, false, permit))
     }
 
     /// Room for a rollout; the second part is held by whoever fetches its outputs.
@@ -152,7 +155,7 @@ impl Door {
         costs: &Costs,
         load: Load,
     ) -> Result<(Ticket, OwnedSemaphorePermit), Error> {
-        let own = self.rollout_cost(costs, load);
+        let [own, share] = self.rollout_cost(costs, load);
         let ahead = nanos(&self.ahead);
         // Tenants share the model evenly, and nobody waits longer than all work takes.
         let tenants = 1 + self.tenants.load(Ordering::Relaxed) as u32;
@@ -165,7 +168,7 @@ impl Door {
         let Ok(permit) = Arc::clone(&self.live.rows).try_acquire_many_owned(load.rows) else {
             return Err(overloaded("rows of rollouts wait", ahead));
         };
-        Ok((self.ticket(load.row_steps(), own, false, permit), outputs))
+        Ok((self.ticket(load.row_steps(), share, false, permit), outputs))
     }
 
     /// Room for a rollout that is one of many; waits for it.
@@ -179,8 +182,8 @@ impl Door {
         let outputs = outputs.await.map_err(closed)?;
         let permit = Arc::clone(&self.bulk.rows).acquire_many_owned(load.rows);
         let permit = permit.await.map_err(closed)?;
-        let own = self.rollout_cost(costs, load);
-        Ok((self.ticket(load.row_steps(), own, false, permit), outputs))
+        let [_, share] = self.rollout_cost(costs, load);
+        Ok((self.ticket(load.row_steps(), share, false, permit), outputs))
     }
 
     /// The most that a bulk rollout may be, in rows and bytes of outputs.
@@ -230,22 +233,25 @@ impl Door {
         costs.observe.full() / self.sizes.observe_block as u32
     }
 
-    fn rollout_cost(&self, costs: &Costs, load: Load) -> Duration {
+    /// How long a rollout takes alone, and its part of the time that workers have together.
+    fn rollout_cost(&self, costs: &Costs, load: Load) -> [Duration; 2] {
         let (rows, lanes) = (load.rows as usize, self.sizes.imagine_block);
         let full = costs.imagine.full().saturating_mul((rows / lanes) as u32);
         let rest = rows % lanes;
         let rest = if rest > 0 { costs.imagine.of(rest) } else { Duration::ZERO };
-        full.saturating_add(rest).saturating_mul(load.steps)
+        let work = full.saturating_add(rest).saturating_mul(load.steps);
+        let at_once = self.workers.min(rows.div_ceil(lanes).max(1) as u32);
+        [at_once, self.workers].map(|workers| work / workers)
     }
 
     fn ticket(
         self: &Arc<Self>,
         row_steps: u64,
-        own: Duration,
+        share: Duration,
         live_observe: bool,
         permit: OwnedSemaphorePermit,
     ) -> Ticket {
-        let nanos = own.as_nanos() as u64;
+        let nanos = share.as_nanos() as u64;
         self.ahead.fetch_add(nanos, Ordering::Relaxed);
         if live_observe {
             self.observing.fetch_add(nanos, Ordering::Relaxed);
@@ -316,7 +322,7 @@ mod tests {
             observe: Cost::new(millis(5), millis(5), 1),
             imagine: Cost::new(millis(8), millis(8), 4),
         };
-        (Arc::new(Door::new(door, sizes)), costs)
+        (Arc::new(Door::new(door, sizes, 1)), costs)
     }
 
     fn load(rows: u32, steps: u32, output_bytes: u64) -> Load {

@@ -1,7 +1,7 @@
 //! The model's thread: takes commands in, computes what the schedulers say, lets models go.
 //!
 //! A tick at a time: first the observes of all models, then steps of rollouts, for which models share the time of a
-//! tick. While there is work nothing here waits, but for observes that come at the same time as others.
+//! tick. Blocks of one model are computed some at once, each by a worker, which is a thread for as long as that takes. While there is work nothing here waits, but for observes that come at the same time as others.
 
 use std::{
     collections::BTreeMap,
@@ -21,8 +21,8 @@ use super::{
     served::Served,
 };
 
-/// How long an observe waits for others to share its block, where blocks hold more than one: a block takes as long
-/// whether or not it is full, and robots that were answered together come again together.
+/// How long an observe waits for others to share its block, where blocks hold more than one: a row costs less among
+/// others, and robots that were answered together come again together.
 const GATHER: Duration = Duration::from_millis(2);
 
 /// How often they are looked for.
@@ -66,7 +66,7 @@ impl Executor {
 
     fn gather(&mut self) {
         let until = Instant::now() + GATHER;
-        while self.served.values().any(|served| served.scheduler().has_room())
+        while self.served.values().any(|served| served.scheduler().has_room(self.config.workers))
             && Instant::now() < until
         {
             match self.commands.try_recv() {
@@ -108,20 +108,22 @@ impl Executor {
         self.door.gauges.tick();
         let rolling = self.served.values().filter(|served| served.scheduler().is_rolling());
         let time = self.config.tick / (rolling.count().max(1) as u32);
-        let ticks: Vec<(ModelId, Tick)> =
-            self.served.iter_mut().map(|(id, served)| (*id, served.next_tick(time))).collect();
+        let workers = self.config.workers;
+        let next =
+            self.served.iter_mut().map(|(id, served)| (*id, served.next_tick(time, workers)));
+        let ticks: Vec<(ModelId, Tick)> = next.collect();
         let tenants = self.served.values().map(|served| served.scheduler().tenants());
         self.door.shared_by(tenants.sum());
         for (id, tick) in &ticks {
             let Some(served) = self.served.get_mut(id) else { continue };
-            for block in tick.seeing.iter().chain(&tick.blind) {
-                served.observe(block);
+            for blocks in tick.seeing.chunks(workers).chain(tick.blind.chunks(workers)) {
+                served.observe(blocks);
             }
         }
         for (id, tick) in &ticks {
             let Some(served) = self.served.get_mut(id) else { continue };
-            for block in &tick.imagine {
-                served.imagine(block);
+            for blocks in tick.imagine.chunks(workers) {
+                served.imagine(blocks);
             }
         }
     }

@@ -51,7 +51,9 @@ pub use self::{
 /// Sizes of the engine.
 #[derive(Clone, Copy, Debug)]
 pub struct EngineConfig {
-    /// Threads of one operation on the CPU.
+    /// Blocks that are computed at once.
+    pub workers: usize,
+    /// Threads of one operation of each of them on the CPU.
     pub threads: usize,
     /// Rows of blocks, and rows on their way.
     pub sizes: Sizes,
@@ -105,7 +107,7 @@ impl Engine {
     /// # Errors
     /// If there is no thread.
     pub fn start(config: EngineConfig) -> Result<(Self, JoinHandle<()>), EngineError> {
-        let door = Arc::new(Door::new(config.door, config.sizes));
+        let door = Arc::new(Door::new(config.door, config.sizes, config.workers));
         // Whoever was let in finds room here without waiting; of bulk work there is half as much.
         let most = 2 * (config.door.observes + config.door.rows);
         let (commands, received) = mpsc::channel(most);

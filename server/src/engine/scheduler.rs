@@ -139,9 +139,10 @@ impl Scheduler {
         self.live.is_empty() && self.bulk.is_empty() && self.shares.tenants() == 0
     }
 
-    /// Whether a live observe waits in a block that others could join.
-    pub fn has_room(&self) -> bool {
-        (1..self.sizes.observe_block).contains(&self.live.len())
+    /// Whether a live observe waits in blocks, computed so many at once, that others could join.
+    pub fn has_room(&self, blocks: usize) -> bool {
+        let size = self.sizes.observe_block;
+        size > 1 && (1..size * blocks).contains(&self.live.len())
     }
 
     /// Tenants that have rollouts.

@@ -14,7 +14,7 @@ use tokio::sync::{mpsc, oneshot};
 
 use super::{
     arena::Arena,
-    batch::{Batch, Computed, compute},
+    batch::{Batch, Computed, Outcome, compute},
     commands::{Chunk, Failure, Imagine, Observe, Observed, Order},
     door::Door,
     models::{LoadedModel, ModelEntry, Newcomer},
@@ -89,11 +89,12 @@ impl Served {
         self.rollouts.insert(id, Rollout { order, left });
     }
 
-    /// What is to be computed next, with rollouts in about `time`.
-    pub(super) fn next_tick(&mut self, time: std::time::Duration) -> Tick {
+    /// What is to be computed next, with rollouts in about `time`, of which so many blocks are computed at once.
+    pub(super) fn next_tick(&mut self, time: std::time::Duration, workers: usize) -> Tick {
         self.forget_the_gone();
         let block = self.entry.upgrade().map(|entry| entry.costs.imagine.full().as_nanos());
-        let blocks = (time.as_nanos() / block.unwrap_or(u128::MAX)).clamp(1, 64) as usize;
+        let rounds = (time.as_nanos() / block.unwrap_or(u128::MAX)).clamp(1, 64) as usize;
+        let blocks = rounds * workers;
         let mut tick = self.scheduler.tick(Instant::now(), blocks);
         for job in std::mem::take(&mut tick.expired) {
             self.fail(job, Failure::Late);
@@ -128,20 +129,24 @@ impl Served {
         }
     }
 
-    /// Computes a block of observes.
-    pub(super) fn observe(&mut self, block: &Block<JobId>) {
-        let started = Instant::now();
-        let jobs: Vec<Option<&Observe>> =
-            block.iter().map(|job| job.map(|job| &self.observes[&job].job)).collect();
-        let batch = Batch::observe(&jobs);
-        let rows = batch.rows();
-        let span = tracing::debug_span!("observe_batch", rows, lanes = block.len());
-        let result = span.in_scope(|| compute(self.world.as_ref(), batch));
-        let elapsed = started.elapsed();
-        self.metrics.batch(Kind::Observe, rows, block.len(), elapsed);
-        self.door.gauges.block(Kind::Observe, rows, block.len(), elapsed);
-        self.measured(Kind::Observe, rows, elapsed);
-        let computed = match result {
+    /// Computes blocks of observes at the same time.
+    pub(super) fn observe(&mut self, blocks: &[Block<JobId>]) {
+        let batch = |block: &Block<JobId>| {
+            let jobs: Vec<Option<&Observe>> =
+                block.iter().map(|job| job.map(|job| &self.observes[&job].job)).collect();
+            Batch::observe(&jobs)
+        };
+        let batches = blocks.iter().map(batch).collect();
+        let outcomes = compute(self.world.as_ref(), batches);
+        for (block, outcome) in blocks.iter().zip(outcomes) {
+            self.observed(block, outcome);
+        }
+    }
+
+    fn observed(&mut self, block: &Block<JobId>, outcome: Outcome) {
+        self.measured(Kind::Observe, block, &outcome);
+        let Outcome { computed, started, .. } = outcome;
+        let computed = match computed {
             Ok(computed) => computed,
             Err(panic) => return self.isolate(block, &panic, |job| *job, Self::observe),
         };
@@ -167,33 +172,38 @@ impl Served {
         }
     }
 
-    /// Computes a block of steps of rollouts.
-    pub(super) fn imagine(&mut self, block: &Block<RowStep>) {
+    /// Computes blocks of steps of rollouts at the same time.
+    pub(super) fn imagine(&mut self, blocks: &[Block<RowStep>]) {
         // A request that failed in an earlier block of this tick is not computed further.
-        let block: Block<RowStep> = block
+        let left = |step: &RowStep| self.rollouts.contains_key(&step.job);
+        let blocks: Vec<Block<RowStep>> = blocks
             .iter()
-            .map(|step| step.filter(|step| self.rollouts.contains_key(&step.job)))
+            .map(|block| block.iter().map(|step| step.filter(left)).collect())
+            .filter(|block: &Block<RowStep>| block.iter().any(Option::is_some))
             .collect();
-        if block.iter().all(Option::is_none) {
-            return;
+        for block in &blocks {
+            self.enter(block);
         }
-        let started = Instant::now();
-        self.enter(&block);
-        let steps: Vec<Option<(&Imagine, RowStep)>> = block
-            .iter()
-            .map(|step| step.map(|step| (&self.rollouts[&step.job].order.job, step)))
-            .collect();
-        let batch = Batch::imagine(&steps, &self.arena);
-        let rows = batch.rows();
-        let span = tracing::debug_span!("imagine_batch", rows, lanes = block.len());
-        let result = span.in_scope(|| compute(self.world.as_ref(), batch));
-        let elapsed = started.elapsed();
-        self.metrics.batch(Kind::Imagine, rows, block.len(), elapsed);
-        self.door.gauges.block(Kind::Imagine, rows, block.len(), elapsed);
-        self.measured(Kind::Imagine, rows, elapsed);
-        let computed = match result {
+        let batch = |block: &Block<RowStep>| {
+            let steps: Vec<Option<(&Imagine, RowStep)>> = block
+                .iter()
+                .map(|step| step.map(|step| (&self.rollouts[&step.job].order.job, step)))
+                .collect();
+            Batch::imagine(&steps, &self.arena)
+        };
+        let batches = blocks.iter().map(batch).collect();
+        let outcomes = compute(self.world.as_ref(), batches);
+        for (block, outcome) in blocks.iter().zip(outcomes) {
+            self.imagined(block, outcome);
+        }
+    }
+
+    fn imagined(&mut self, block: &Block<RowStep>, outcome: Outcome) {
+        self.measured(Kind::Imagine, block, &outcome);
+        let Outcome { computed, started, .. } = outcome;
+        let computed = match computed {
             Ok(computed) => computed,
-            Err(panic) => return self.isolate(&block, &panic, |step| step.job, Self::imagine),
+            Err(panic) => return self.isolate(block, &panic, |step| step.job, Self::imagine),
         };
         for (lane, step) in block.iter().enumerate() {
             let Some(step) = step else { continue };
@@ -202,11 +212,14 @@ impl Served {
                 self.fail(step.job, Failure::NotFinite);
             }
         }
-        self.keep(&block, &computed);
-        self.deliver(&block, &computed, started);
+        self.keep(block, &computed);
+        self.deliver(block, &computed, started);
     }
 
-    fn measured(&self, kind: Kind, rows: usize, elapsed: std::time::Duration) {
+    fn measured<T>(&self, kind: Kind, block: &Block<T>, outcome: &Outcome) {
+        let (rows, elapsed) = (block.iter().flatten().count(), outcome.elapsed);
+        self.metrics.batch(kind, rows, block.len(), elapsed);
+        self.door.gauges.block(kind, rows, block.len(), elapsed);
         let Some(entry) = self.entry.upgrade() else { return };
         let cost = match kind {
             Kind::Observe => &entry.costs.observe,
@@ -281,7 +294,7 @@ impl Served {
         block: &Block<T>,
         panic: &str,
         job_of: impl Fn(&T) -> JobId,
-        again: impl Fn(&mut Self, &Block<T>),
+        again: impl Fn(&mut Self, &[Block<T>]),
     ) {
         let mut jobs: Vec<JobId> = block.iter().flatten().map(&job_of).collect();
         jobs.sort_unstable();
@@ -293,7 +306,7 @@ impl Served {
         for job in jobs {
             let alone: Block<T> =
                 block.iter().map(|row| row.filter(|row| job_of(row) == job)).collect();
-            again(self, &alone);
+            again(self, &[alone]);
         }
     }
 

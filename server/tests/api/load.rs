@@ -232,7 +232,7 @@ async fn two_rollouts_advance_side_by_side() {
 
 #[tokio::test]
 async fn a_tenant_with_many_rollouts_does_not_crowd_out_another() {
-    let config = Config { imagine_block: 4, tick_millis: 0, ..config() };
+    let config = Config { workers: 1, imagine_block: 4, tick_millis: 0, ..config() };
     let server = TestServer::with(config).await;
     let (many, one) = (server.seasoned(4, 1).await, server.seasoned(5, 1).await);
     let mut counts = Vec::new();

@@ -121,6 +121,7 @@ pub(crate) fn named(name: &str) -> Config {
         grpc_listen: any,
         http_listen: any,
         admin_listen: any,
+        workers: 2,
         threads: 1,
         ..Config::default()
     }

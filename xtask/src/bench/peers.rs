@@ -54,7 +54,9 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
     let place = Place::new(tools)?;
     let seconds = if arguments.quick { 2.0 } else { 8.0 };
     let mut server = Command::new(tools.programs.named("gatsbi-server")?);
-    server.args(["--threads", "2", "--observe-block", "16", "--checkpoint"]).arg(&place.checkpoint);
+    server
+        .args(["--workers", "2", "--threads", "1", "--observe-block", "8", "--checkpoint"])
+        .arg(&place.checkpoint);
     let log = tools.folder.path().join("server.log");
     let server = Server::start(&mut server, &log, &tools.interrupt)?;
     let mut ours = load(tools, None, &server.grpc)?;

@@ -39,10 +39,10 @@ fn counts(scheduler: &mut Scheduler, ticks: usize) -> BTreeMap<u64, usize> {
 #[test]
 fn a_block_has_room_while_an_observe_waits_alone_in_it() {
     let mut scheduler = Scheduler::new(SIZES);
-    assert!(!scheduler.has_room(), "nobody waits");
+    assert!(!scheduler.has_room(1), "nobody waits");
     for (job, room) in [(0, true), (1, false)] {
         observe(&mut scheduler, job, true, Urgency::Live, job);
-        assert_eq!(scheduler.has_room(), room);
+        assert_eq!(scheduler.has_room(1), room);
     }
 }
 
