@@ -61,7 +61,8 @@ enum Command {
     },
     /// Train a checkpoint by a recipe.
     Train {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects or tiny-finish.
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects, tiny-finish or
+        /// tiny-long.
         #[arg(long)]
         recipe: String,
         /// Data set.
@@ -87,7 +88,8 @@ enum Command {
     ///
     /// A run that was stopped goes on; one that is done is measured again.
     Ablate {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects or tiny-finish.
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects, tiny-finish or
+        /// tiny-long.
         #[arg(long)]
         recipe: String,
         /// Variants to compare.

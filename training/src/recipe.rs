@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::variant::Variant;
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 9] = [
+const NAMED: [(&str, &str); 10] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -21,6 +21,7 @@ const NAMED: [(&str, &str); 9] = [
     ("tiny-refine", include_str!("../recipes/tiny-refine.toml")),
     ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
     ("tiny-finish", include_str!("../recipes/tiny-finish.toml")),
+    ("tiny-long", include_str!("../recipes/tiny-long.toml")),
 ];
 
 /// How a model is trained.
@@ -336,6 +337,9 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("balls, tiny, tiny-refine, tiny-objects, tiny-finish"), "{error}");
+        assert!(
+            error.contains("balls, tiny, tiny-refine, tiny-objects, tiny-finish, tiny-long"),
+            "{error}"
+        );
     }
 }
