@@ -49,13 +49,14 @@ class Arena:
     def episode(self, number: int, who: str) -> tuple[dict[str, Any], list[Array]]:
         """One episode, and its frames."""
         seed, believing, judging = FIRST_SEED + number, self._believing, self._judging
-        goal = judging.draw(self._scene, seed)
         client = self._client if who == "policy" else None
+        goal = judging.draw(self._scene, None, seed)
+        seen_goal = believing.draw(self._scene, client, seed) if client else goal
         now, beginning = robot.begin(self._scene, client, seed, believing.outputs)
         session, outputs = beginning.session, beginning.outputs
         judging.pursue(goal, beginning, judging.truth(now))
         if session is not None:
-            believing.pursue(goal, beginning, outputs)
+            believing.pursue(seen_goal, beginning, outputs)
         rng = np.random.default_rng([5, number])
         rewards, frames = [], [np.array(now.rgb)]
         told: dict[str, Any] = {"number": number, "at_first": judging.left(judging.truth(now)), "off": []}

@@ -10,6 +10,7 @@ from typing import Mapping, Sequence
 
 import gymnasium
 import numpy as np
+from gatsbi_client import Client
 from gatsbi_sim import Observation, Simulator
 
 import goals
@@ -98,7 +99,7 @@ class Push:
         table = np.concatenate([np.ones((len(places), 1)), places, np.zeros((len(places), 3))], axis=1)
         return {"object_ids": np.arange(len(places))[None], "objects": table[None]}
 
-    def draw(self, scene: Simulator, seed: int) -> tuple[Array, Array]:
+    def draw(self, scene: Simulator, client: Client | None, seed: int) -> tuple[Array, Array]:
         """The goal of an episode in the simulator: where its object is in the picture, and the place to bring it to."""
         now, _ = begin(scene, None, seed)
         at = self.truth(now)["objects"][0, :, 1:3]

@@ -1,4 +1,4 @@
-"""Reach: bring the arm to where it should be in the picture.
+"""Reach: bring the arm to where it is in another picture.
 
 The arm's place is the centre of its mask, which is all that the policy sees beside its goal.
 """
@@ -9,6 +9,7 @@ from typing import Mapping, Sequence
 
 import gymnasium
 import numpy as np
+from gatsbi_client import Client
 from gatsbi_client.gym import mask_centres
 from gatsbi_sim import Observation, Simulator
 
@@ -51,10 +52,12 @@ class Reach:
         """What the service would say if it knew the truth."""
         return {"agent_mask": (np.array(now.mask) == 1)[None].astype(np.float32)}
 
-    def draw(self, scene: Simulator, seed: int) -> Array:
-        """The goal `[1, 2]` of an episode in the simulator."""
-        shown, _ = begin(scene, None, seed + GOAL_SEEDS)
-        return mask_centres(self.truth(shown)["agent_mask"])
+    def draw(self, scene: Simulator, client: Client | None, seed: int) -> Array:
+        """The goal `[1, 2]` of an episode in the simulator, as the service sees it or, without a client, as it is."""
+        shown, beginning = begin(scene, client, seed + GOAL_SEEDS, self.outputs)
+        if beginning.session is not None:
+            beginning.session.delete()
+        return mask_centres((beginning.outputs or self.truth(shown))["agent_mask"])
 
     def pursue(self, goal: Array, beginning: Beginning, outputs: Mapping[str, Array]) -> None:
         """As `begin`, of one row, in the simulator."""

@@ -72,8 +72,8 @@ class RobotTask(Task, Protocol):
     def truth(self, now: Observation) -> dict[str, Array]:
         """What the service would say if it knew the truth."""
 
-    def draw(self, scene: Simulator, seed: int) -> Any:
-        """The goal of an episode in the simulator."""
+    def draw(self, scene: Simulator, client: Client | None, seed: int) -> Any:
+        """The goal of an episode in the simulator: as the service sees it or, without a client, as it is."""
 
     def pursue(self, goal: Any, beginning: Beginning, outputs: Mapping[str, Array]) -> None:
         """As `begin`, of one row, in the simulator."""
