@@ -34,7 +34,7 @@ FIRST_SEED = 900_000
 """Of episodes; none of them was trained on."""
 ARMS = ("nothing", "random", "policy")
 SHOWN = 3
-"""Episodes in the picture."""
+"""Episodes of an arm in the picture."""
 ZOOM = 2
 
 
