@@ -101,6 +101,7 @@ def main(arguments: list[str] | None = None) -> None:
     parse.add_argument("task", choices=TASKS)
     parse.add_argument("out", type=Path, help="where train.py has left the policy")
     parse.add_argument("--episodes", type=int, default=50)
+    parse.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS)
     parse.add_argument("--picture", type=Path, help="the first episodes of chance and of the policy")
     parse.add_argument("--checkpoint", type=Path, default=ROOT / "models/checkpoints/push1-tiny.safetensors")
     given = parse.parse_args(arguments)
@@ -112,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
         scene = stack.enter_context(Simulator(SCENE, size=SIZE, program=program))
         client = stack.enter_context(Client(stack.enter_context(Server(given.checkpoint)), timeout=600))
         arena = Arena(scene, client, given.task, policy)
-        for who in ARMS:
+        for who in given.arms:
             done, lines = [], given.out / f"{who}.jsonl"
             lines.unlink(missing_ok=True)
             for number in range(given.episodes):
@@ -125,8 +126,8 @@ def main(arguments: list[str] | None = None) -> None:
                     strips.append(strip(title, frames, told["mark"]))
             parts = (mean([each[name] for each in done]) for name in ("return", "left", "at_first"))
             print(f"| {who} | {len(done)} | {' | '.join(parts)} |", flush=True)
-    off = np.median(np.concatenate([each["off"] for each in done]))
-    print(f"\nThe service's distance from the goal differs from the true one by {off:.3f} {unit} (median).")
+            if off := [step for each in done for step in each["off"]]:
+                print(f"\nWhat the service believes to be left differs by {np.median(off):.3f} {unit} (median).")
     if given.picture is not None:
         Image.fromarray(np.concatenate(strips)).save(given.picture, optimize=True)
 
