@@ -50,13 +50,18 @@ def draw(scene: Simulator, number: int) -> Goal:
         angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*DISTANCES)
         along = np.array([np.cos(angle), np.sin(angle)])
         target, begin = places[named] + along * distance, places[named] - along * BEGIN
-        others = np.delete(places, named, axis=0)
-        clear = (np.linalg.norm(others[:, None] - [target, begin], axis=-1) > CLEARANCE).all()
-        if clear and _inside(target, TARGET_MARGIN) and _inside(begin, BEGIN_MARGIN):
+        if roomy(places, named, target, begin):
             break
     shown = scene.set_goal([target if each == named else None for each in range(len(places))])
     pixel = shown.state["objects"][named]["pixel"]
     return Goal(number, seed, named, (float(target[0]), float(target[1])), (pixel[0], pixel[1]), distance)
+
+
+def roomy(places: np.ndarray, named: int, target: np.ndarray, begin: np.ndarray) -> bool:
+    """Whether an object of those at `[n, 2]` has room at its target, and the hand where the push begins."""
+    others = np.delete(places, named, axis=0)
+    clear = bool((np.linalg.norm(others[:, None] - [target, begin], axis=-1) > CLEARANCE).all())
+    return clear and _inside(target, TARGET_MARGIN) and _inside(begin, BEGIN_MARGIN)
 
 
 def in_image(pixel: object) -> np.ndarray:
@@ -80,9 +85,17 @@ class Table:
         self._matrix = np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3)
 
     def metres(self, at: np.ndarray) -> np.ndarray:
-        """The place on the table, metres, of a position `[2]` in [-1, 1]."""
-        x, y, scale = self._matrix @ [*at, 1.0]
-        return np.array([x / scale, y / scale])
+        """Places on the table, metres, of positions `[..., 2]` in [-1, 1]."""
+        return _mapped(self._matrix, at)
+
+    def picture(self, place: np.ndarray) -> np.ndarray:
+        """Positions in [-1, 1] of places `[..., 2]` on the table."""
+        return _mapped(np.linalg.inv(self._matrix), place)
+
+
+def _mapped(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    to = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ matrix.T
+    return to[..., :2] / to[..., 2:]
 
 
 def _inside(point: np.ndarray, margin: float) -> bool:

@@ -167,10 +167,14 @@ class AsyncClient:
             answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
 
     async def open_handles(
-        self, starts: Iterable[str | bytes], *, samples: int | None = None, seed: int | None = None
+        self, starts: Iterable[str | bytes], *, samples: int | None = None, seed: int | None = None,
+        independent: bool = False,
     ) -> AsyncHandles:
-        """Rows for a policy outside: one for each session id or snapshot, times `samples`."""
-        return AsyncHandles(self, await self._call(core.open_handles(starts, samples, seed)))
+        """Rows for a policy outside: one for each session id or snapshot, times `samples`.
+
+        Starts share random numbers, sample by sample, unless they are `independent`.
+        """
+        return AsyncHandles(self, await self._call(core.open_handles(starts, samples, seed, independent)))
 
 
 class AsyncSession:

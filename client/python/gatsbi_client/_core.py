@@ -328,8 +328,12 @@ def _start(start: str | bytes, at_step: int | None = None) -> im.Start:
     return im.Start(session=im.SessionStart(session_id=start, at_step=at_step))
 
 
-def open_handles(starts: Iterable[str | bytes], samples: int | None, seed: int | None) -> Call[t.HandlesInfo]:
-    request = im.OpenHandlesRequest(starts=[_start(each) for each in starts], sampling=sampling(samples, seed))
+def open_handles(
+    starts: Iterable[str | bytes], samples: int | None, seed: int | None, independent: bool
+) -> Call[t.HandlesInfo]:
+    drawn = sampling(samples, seed)
+    drawn.independent_candidates = independent
+    request = im.OpenHandlesRequest(starts=[_start(each) for each in starts], sampling=drawn)
     return Call("ImaginationService/OpenHandles", request, im.OpenHandlesResponse,
                 lambda r: t.HandlesInfo(r.handles_id, r.rows, r.model_hash, r.seed), False)
 

@@ -167,10 +167,14 @@ class Client:
             answers.cancel()  # type: ignore[no-untyped-call,unused-ignore]
 
     def open_handles(
-        self, starts: Iterable[str | bytes], *, samples: int | None = None, seed: int | None = None
+        self, starts: Iterable[str | bytes], *, samples: int | None = None, seed: int | None = None,
+        independent: bool = False,
     ) -> Handles:
-        """Rows for a policy outside: one for each session id or snapshot, times `samples`."""
-        return Handles(self, self._call(core.open_handles(starts, samples, seed)))
+        """Rows for a policy outside: one for each session id or snapshot, times `samples`.
+
+        Starts share random numbers, sample by sample, unless they are `independent`.
+        """
+        return Handles(self, self._call(core.open_handles(starts, samples, seed, independent)))
 
 
 class Session:

@@ -54,7 +54,7 @@ class ModelEnv:
         """Steps all rows by `[B, A]`: objects `[B, MAX, 6]`, rewards and ends `[B, 1]`. Rows never end by themselves."""
         if self._handles is None:
             starts = [self._session.id] * (1 if sample else self._rows)
-            drawn = {"samples": self._rows, "seed": self._seed} if sample else {}
+            drawn: dict[str, Any] = {"samples": self._rows, "seed": self._seed} if sample else {}
             self._handles, self._samples = self._client.open_handles(starts, **drawn), sample
         if sample != self._samples:
             raise ValueError(f"rows that began with sample={self._samples} cannot go on with sample={sample}")

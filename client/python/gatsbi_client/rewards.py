@@ -38,3 +38,14 @@ def action_bounds(model: Model) -> tuple[Floats, Floats]:
 def visible(outputs: Mapping[str, Array]) -> Floats:
     """The objects `[rows, MAX, 6]`, with zeros in slots that were never filled."""
     return np.where(outputs["object_ids"][..., None] >= 0, outputs["objects"], 0).astype(np.float32)
+
+
+def mask_centres(masks: Array) -> Floats:
+    """Centres `[..., 2]` of masks `[..., H, W]`: x rightwards and y downwards in [-1, 1]; (0, 0) of empty ones."""
+    weights = masks.astype(np.float32)
+    height, width = weights.shape[-2:]
+    total = np.maximum(weights.sum(axis=(-2, -1)), 1e-9)
+    x = (weights.sum(axis=-2) @ ((np.arange(width) + 0.5) * 2 / width - 1)) / total
+    y = (weights.sum(axis=-1) @ ((np.arange(height) + 0.5) * 2 / height - 1)) / total
+    empty = total < 1e-6
+    return np.where(empty[..., None], 0, np.stack([x, y], axis=-1)).astype(np.float32)
