@@ -31,6 +31,9 @@ use crate::{
     tls::{Tls, TlsError},
 };
 
+/// How long the engine may take to end when all requests have, or were cut off.
+const ENGINE_END: Duration = Duration::from_secs(2);
+
 /// A running server.
 #[derive(Debug)]
 pub struct App {
@@ -222,7 +225,7 @@ impl App {
             self.tasks.shutdown().await;
         }
         // Connections that outlive their server hold on to the engine; the process does not wait for them.
-        tokio::time::timeout(self.drain, self.engine_ended()).await.ok();
+        tokio::time::timeout(ENGINE_END, self.engine_ended()).await.ok();
     }
 }
 

@@ -96,7 +96,7 @@ fn run(layered: Layered) -> anyhow::Result<()> {
     done
 }
 
-async fn serve(mut layered: Layered) -> anyhow::Result<()> {
+async fn serve(layered: Layered) -> anyhow::Result<()> {
     let logs = Logs::start(&layered.config)?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut terminate = signal(SignalKind::terminate())?;
@@ -115,7 +115,7 @@ async fn serve(mut layered: Layered) -> anyhow::Result<()> {
             _ = hang_up.recv() => match configuration() {
                 Ok(new) => {
                     tokio::select! {
-                        () = reload::apply(&app, &logs, &layered, &new) => layered = new,
+                        () = reload::apply(&app, &logs, &layered, &new) => {}
                         _ = interrupt.recv() => break false,
                         _ = terminate.recv() => break false,
                     }

@@ -20,9 +20,10 @@ use crate::{
 /// Settings that take effect while the server runs.
 const LIVE: [&str; 4] = ["log", "tenant_max_sessions", "tenant_max_rows", "tenant_max_kept_mib"];
 
-/// Applies a configuration to a running server that was started with an earlier one.
-pub async fn apply(app: &App, logs: &Logs, old: &Layered, new: &Layered) {
-    for setting in needs_restart(old, new) {
+/// Applies a configuration to a running server. What differs from the one that it was started with and needs a restart
+/// is told each time, until there is one.
+pub async fn apply(app: &App, logs: &Logs, started: &Layered, new: &Layered) {
+    for setting in needs_restart(started, new) {
         tracing::warn!(setting, "changed, and takes effect when the server starts anew");
     }
     if let Err(error) = logs.set(&new.config.log) {
@@ -41,7 +42,7 @@ pub async fn apply(app: &App, logs: &Logs, old: &Layered, new: &Layered) {
         }
     }
     if let Some(service) = app.service() {
-        checkpoints(&service, old).await;
+        checkpoints(&service, started).await;
     }
 }
 
@@ -57,19 +58,19 @@ pub fn refused(problem: Unusable) {
 }
 
 /// Names of settings that differ and do not take effect.
-fn needs_restart(old: &Layered, new: &Layered) -> Vec<String> {
+fn needs_restart(started: &Layered, new: &Layered) -> Vec<String> {
     let lines = |layered: &Layered| render(&layered.matches, Style::Effective);
-    let (old, new) = (lines(old), lines(new));
+    let (old, new) = (lines(started), lines(new));
     let changed = old.lines().zip(new.lines()).filter(|(old, new)| old != new);
     let names = changed.filter_map(|(_, new)| new.trim_start_matches("# ").split(" = ").next());
     names.filter(|name| !LIVE.contains(name)).map(str::to_owned).collect()
 }
 
 /// Serves checkpoints whose files have changed, and new ones in the folder; sessions that are open keep theirs.
-async fn checkpoints(service: &Arc<Service>, old: &Layered) {
-    let folder = old.config.checkpoints();
+async fn checkpoints(service: &Arc<Service>, started: &Layered) {
+    let folder = started.config.checkpoints();
     let named = Checkpoints { folder: None, ..folder.clone() };
-    let mut files: Vec<_> = old
+    let mut files: Vec<_> = started
         .config
         .checkpoints
         .iter()

@@ -124,7 +124,8 @@ impl Kind {
 /// What the model's thread counts for one model.
 #[derive(Debug)]
 pub struct StepMetrics {
-    model: String,
+    panicked: Counter,
+    not_finite: Counter,
     given_up: Counter,
     kinds: [[Histogram; 3]; 2],
 }
@@ -136,8 +137,12 @@ impl StepMetrics {
             [BATCH_ROWS, BATCH_FILL, STEP_SECONDS]
                 .map(|name| histogram!(name, "model" => model.to_owned(), "kind" => kind.label()))
         };
+        // Shown as 0 from the start: an increase from nothing is none, and the first failure would raise no alarm.
+        let failed =
+            |failure| counter!(FAILURES, "model" => model.to_owned(), "failure" => failure);
         Self {
-            model: model.to_owned(),
+            panicked: failed("panicked"),
+            not_finite: failed("not_finite"),
             given_up: counter!(GIVEN_UP, "model" => model.to_owned()),
             kinds: [of(Kind::Observe), of(Kind::Imagine)],
         }
@@ -153,12 +158,11 @@ impl StepMetrics {
 
     /// The model failed a request; being late is not its fault.
     pub fn failed(&self, failure: Failure) {
-        let failure = match failure {
-            Failure::Late => return,
-            Failure::Panicked => "panicked",
-            Failure::NotFinite => "not_finite",
-        };
-        counter!(FAILURES, "model" => self.model.clone(), "failure" => failure).increment(1);
+        match failure {
+            Failure::Late => {}
+            Failure::Panicked => self.panicked.increment(1),
+            Failure::NotFinite => self.not_finite.increment(1),
+        }
     }
 
     /// A client went away.

@@ -78,14 +78,18 @@ def test_a_session_shows_its_belief_and_follows_it(open_page, server, arm, shots
     colours = rows.locator("visible=true").evaluate_all(
         "rows => rows.filter(row => !row.classList.contains('faint')).map(row => row.querySelector('.mark').style.background)")
     assert len(set(colours)) == len(colours) >= 1 and "" not in colours
-    # Every overlay changes the picture, and changes it back.
-    for name in ["Agent", "Objects", "Background", "Boxes and ids", "Keypoints"]:
+
+    def toggles(name):
+        """An overlay changes the picture, and changes it back."""
         before = picture(page)
         page.get_by_role("checkbox", name=name).click()
         changed = picture(page)
         assert changed != before, name
         page.get_by_role("checkbox", name=name).click()
         assert picture(page) == before, name
+
+    for name in ["Agent", "Objects", "Background", "Boxes and ids", "Keypoints"]:
+        toggles(name)
     before = picture(page)
     page.get_by_role("radio", name="Belief").click()
     assert picture(page) != before
@@ -93,7 +97,11 @@ def test_a_session_shows_its_belief_and_follows_it(open_page, server, arm, shots
     server.observe(arm, step + 1, step + 6)
     at_step(page, step + 5)
     assert picture(page) != before
+    toggles("Trails")
     expect(page.get_by_role("img", name=re.compile("Surprise: now .* nats"))).to_be_visible()
+    expect(page.get_by_role("img", name=re.compile(r"Time of a step: now [\d.,]+ m?s, highest of the last \d+ [\d.,]+ m?s"))).to_be_visible()
+    page.get_by_role("button", name="Repeat what was done").click()
+    expect(page.get_by_text(re.compile(r"As the last [56] steps"))).to_be_visible()
     with page.expect_download() as saved:
         page.get_by_role("button", name="overlay.png").click()
     assert saved.value.suggested_filename == "overlay.png"
@@ -184,6 +192,7 @@ def test_models_have_cards_and_the_engine_tells_its_load(open_page, server, arm,
     step = newest(server, arm)
     server.observe(arm, step + 1, step + 5)
     expect(cell).to_have_text(f"{rows + 4:,}")
+    expect(page.get_by_text(re.compile(r"Ticks: [\d,]+\. Requests refused: \d+\. What waits now is predicted to take [\d.,]+ \S+\."))).to_be_visible()
     page.wait_for_timeout(1500)
     page.screenshot(path=shots / "engine.png", full_page=True)
 

@@ -29,7 +29,7 @@ const FILES: &[(&str, &str)] = &[
     ("docker/prometheus/alerts.yml", "share/prometheus/alerts.yml"),
     ("docker/grafana/dashboards/gatsbi.json", "share/grafana/gatsbi.json"),
     ("docs/metrics.md", "share/doc/metrics.md"),
-    ("README.md", "share/doc/README.md"),
+    ("docs/operating.md", "share/doc/operating.md"),
     ("LICENSE-APACHE", "licenses/LICENSE-APACHE"),
     ("LICENSE-MIT", "licenses/LICENSE-MIT"),
 ];

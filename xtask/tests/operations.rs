@@ -168,10 +168,64 @@ fn settings_of_the_image_and_the_unit_name_places_of_the_package() {
         "share/checkpoints",
         "etc/gatsbi.toml",
         "systemd/gatsbi.service",
-        "share/doc/README.md",
+        "share/doc/operating.md",
     ] {
         assert!(unit.contains(&format!("/opt/gatsbi/{place}")), "{place}");
         assert!(package.contains(&format!("\"{place}")), "{place}");
+    }
+}
+
+#[test]
+fn links_of_packaged_documents_lead_to_the_package() {
+    let package = read("xtask/src/package.rs");
+    // Source and place, a pair a line.
+    let pairs = package.lines().filter_map(|line| {
+        let mut words = line.trim().strip_prefix("(\"")?.split('"');
+        Some((words.next()?, words.nth(1)?))
+    });
+    let places: Vec<_> =
+        pairs.filter_map(|pair| pair.1.strip_prefix("share/doc/").zip(Some(pair.0))).collect();
+    assert_eq!(places.len(), 2, "{places:?}");
+    for (place, source) in &places {
+        let text = read(source);
+        let links = text.split("](").skip(1).filter_map(|rest| rest.split(')').next());
+        for link in links.filter(|link| !link.starts_with("https://") && !link.starts_with('#')) {
+            let page = link.split('#').next();
+            assert!(places.iter().any(|(place, _)| Some(*place) == page), "{place}: {link}");
+        }
+    }
+}
+
+#[test]
+fn the_unit_leaves_the_server_what_it_needs() {
+    let unit = read("docker/gatsbi.service");
+    let mut denied = false;
+    // The first line lets calls in; each one after it takes some away or gives them back.
+    for line in unit.lines().filter_map(|line| line.strip_prefix("SystemCallFilter=")) {
+        match line.strip_prefix('~') {
+            Some(calls) => denied |= calls.split(' ').any(|it| it == "@resources"),
+            None => denied &= line.split(' ').all(|it| it != "sched_setaffinity"),
+        }
+    }
+    assert!(!denied, "MKL calls sched_setaffinity while a checkpoint loads");
+    let hidden = unit.lines().any(|line| line == "ProcSubset=pid");
+    assert!(!hidden, "without /proc/cpuinfo libtorch takes its slowest kernels");
+}
+
+#[test]
+fn a_container_is_given_longer_than_draining_takes() {
+    let seconds = |text: &str, before: &str| -> u64 {
+        let rest = text.split_once(before).unwrap_or_else(|| panic!("no {before}")).1;
+        rest.chars().take_while(char::is_ascii_digit).collect::<String>().parse().unwrap()
+    };
+    let drain = seconds(&read("server/gatsbi.toml"), "# drain_seconds = ");
+    let engine = seconds(&read("server/src/app.rs"), "ENGINE_END: Duration = Duration::from_secs(");
+    assert!(!read("docker/gatsbi.toml").contains("drain_seconds"));
+    for (file, grace) in [
+        ("docker/compose.yaml", "stop_grace_period: "),
+        ("docker/gatsbi.service", "TimeoutStopSec="),
+    ] {
+        assert!(seconds(&read(file), grace) > drain + engine, "{file}");
     }
 }
 

@@ -55,7 +55,8 @@ fn document(files: &FileDescriptorSet) -> Json {
             "description": "The same use cases as the gRPC package gatsbi.v1, with its messages as JSON: fields have \
                 the names of the messages, 64-bit integers are numbers, bytes are base64, enum values their full \
                 names, and unknown fields are refused. Every path also understands and, asked for by Accept, gives \
-                application/x-protobuf. The header Gatsbi-Tenant names who shares the server with others.",
+                application/x-protobuf. Where the server has no keys, the header \
+                Gatsbi-Tenant names who shares it with others.",
             "license": { "name": "Apache-2.0 OR MIT", "identifier": "Apache-2.0 OR MIT" },
         },
         "paths": paths,

@@ -236,6 +236,13 @@ mod tests {
     }
 
     #[test]
+    fn settings_of_the_image_are_understood() {
+        let config = read_file(include_str!("../../../docker/gatsbi.toml"), &[]).unwrap();
+        assert!(config.is_public() && config.open_metrics && config.keys.is_some());
+        assert_eq!(config.checkpoints.len(), 1);
+    }
+
+    #[test]
     fn all_that_is_wrong_is_told_at_once() {
         let text = "threads = 2\n[limits]\nmax_rows = \"many\"\nmax_sessions = 0\nthreads = 2\n\
                     [listeners]\nallow_public = 7\n[engine]\ntick_millis = {}\n";

@@ -19,6 +19,7 @@ use tonic::transport::Channel;
 use crate::{
     knock::{self, Answer, KeyFile, Things, methods, name},
     support::{TestServer, config, observation},
+    watching::Feed,
 };
 
 const NOWHERE: &str = "00000000000000000000000000000000";
@@ -294,6 +295,15 @@ async fn what_is_anothers_looks_as_if_it_did_not_exist() {
     assert_eq!(rivals["sessions"].as_array().map_or(0, Vec::len), 0, "{rivals}");
     let own: Json = listed(&guarded.read).await.unwrap().json().await.unwrap();
     assert!(own["sessions"].as_array().unwrap().len() > 10);
+    let overview = async |key: &str| {
+        let feed = guarded.server.get("/v1/live?thumbnails=true").bearer_auth(key).send().await;
+        let (name, told) = Feed::of(feed.unwrap()).next().await.unwrap();
+        assert_eq!(name, "overview");
+        (told["sessions"].as_array().unwrap().len(), told["open_sessions"].as_u64().unwrap())
+    };
+    assert_eq!(overview(&guarded.rival).await, (0, 0));
+    let (listed, open) = overview(&guarded.read).await;
+    assert!(listed > 10 && open > 10, "{listed} {open}");
     guarded.server.app.shutdown().await;
 }
 
@@ -357,6 +367,8 @@ async fn health_and_the_document_are_open_and_answers_are_strict() {
         assert!(!csp.contains("unsafe"), "{csp}");
         assert_eq!(header("x-content-type-options"), "nosniff");
         assert_eq!(header("referrer-policy"), "no-referrer");
+        assert_eq!(header("x-frame-options"), "DENY");
+        assert_eq!(header("cross-origin-resource-policy"), "same-origin");
         let page = answer.text().await.unwrap();
         // What the policy would not let a browser run or show.
         for inline in ["<script>", "<style>", " style=", " onload=", " onclick="] {
@@ -370,6 +382,26 @@ async fn health_and_the_document_are_open_and_answers_are_strict() {
         .await;
     assert!(health.is_ok(), "{health:?}");
     guarded.server.app.shutdown().await;
+}
+
+#[tokio::test]
+async fn open_metrics_open_nothing_else() {
+    let mut file = KeyFile::new();
+    file.key("lab", Role::Admin);
+    let keys = Some(file.0.path().to_owned());
+    let server = TestServer::with(Config { keys, open_metrics: true, ..config() }).await;
+    let admin = format!("http://{}", server.app.admin);
+    let client = reqwest::Client::new();
+    let status = async |request: reqwest::RequestBuilder| request.send().await.unwrap().status();
+    assert_eq!(status(client.get(format!("{admin}/metrics"))).await, 200);
+    for request in [
+        client.post(format!("{admin}/v1/models")).json(&json!({ "path": "x" })),
+        client.post(format!("{admin}/metrics")),
+        server.get("/v1/models"),
+    ] {
+        assert_eq!(status(request).await, 401);
+    }
+    server.app.shutdown().await;
 }
 
 #[tokio::test]

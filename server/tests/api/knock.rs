@@ -223,6 +223,14 @@ impl KeyFile {
         self.write(&left);
     }
 
+    /// Gives a key another role.
+    pub(crate) fn lower(&mut self, secret: &str, role: Role) {
+        let digest = KeyDigest::of(secret);
+        self.revoke(secret);
+        let tenant = "lab".to_owned();
+        self.write(&written(&Entry { tenant, role, digest, name: None, expires: None }));
+    }
+
     pub(crate) fn write(&mut self, text: &str) {
         use std::io::Write as _;
         self.0.write_all(format!("\n{text}").as_bytes()).unwrap();

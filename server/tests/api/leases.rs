@@ -12,6 +12,7 @@ use tonic_types::StatusExt as _;
 use crate::{
     knock::KeyFile,
     support::{TestServer, config, observation},
+    watching::Feed,
 };
 
 async fn soon<T>(answer: impl Future<Output = T>) -> T {
@@ -137,6 +138,27 @@ async fn streams_and_feeds_end_when_their_key_is_taken_out() {
     guarded.reload();
     open.ends("WRONG_KEY").await;
     other.step(1).await.unwrap();
+    guarded.server.app.shutdown().await;
+}
+
+#[tokio::test]
+async fn a_control_loop_ends_when_its_key_may_do_less() {
+    let mut guarded = Guarded::start().await;
+    let lowered = guarded.file.key("lab", Role::Predict);
+    guarded.reload();
+    let mut control_loop = guarded.control_loop(&lowered).await;
+    let feed = guarded.server.get("/v1/live").bearer_auth(&lowered).send().await.unwrap();
+    let mut feed = Feed::of(feed);
+    assert_eq!(soon(feed.next()).await.unwrap().0, "overview");
+    guarded.file.lower(&lowered, Role::Read);
+    guarded.reload();
+    let ended = soon(control_loop.answers.message()).await.unwrap_err();
+    assert_eq!(ended.code(), Code::PermissionDenied, "{ended:?}");
+    assert_eq!(ended.get_error_details().error_info().unwrap().reason, "ROLE_TOO_LOW");
+    // What the role is enough for goes on.
+    for _ in 0..2 {
+        assert_eq!(soon(feed.next()).await.unwrap().0, "overview");
+    }
     guarded.server.app.shutdown().await;
 }
 

@@ -37,6 +37,11 @@ async fn what_a_server_shows_is_in_the_table() {
     server.imagine(rollout(&session, 2, 2)).await.unwrap();
     server.observe(observation(&session, 9)).await.unwrap_err();
     let shown = server.admin("/metrics").await.text().await.unwrap();
+    for failure in ["panicked", "not_finite"] {
+        let labels = format!("{{model=\"metered\",failure=\"{failure}\"}}");
+        let line = format!("gatsbi_model_failures_total{labels} 0");
+        assert!(shown.lines().any(|it| it == line), "{line}: alerts need it before it counts");
+    }
     let documented = documented();
     let mut kinds = BTreeSet::new();
     for line in shown.lines().filter(|line| !line.is_empty()) {

@@ -9,22 +9,26 @@ use serde_json::Value as Json;
 use crate::support::{TestServer, floats, observation, outputs, picture, tensor};
 
 /// A feed on its way.
-struct Feed {
+pub(crate) struct Feed {
     response: reqwest::Response,
     text: String,
 }
 
 impl Feed {
     async fn open(server: &TestServer, path: &str) -> Self {
-        let response = server.get(path).send().await.unwrap();
-        assert_eq!(response.status(), 200, "{path}");
+        Self::of(server.get(path).send().await.unwrap())
+    }
+
+    /// What came of asking for one.
+    pub(crate) fn of(response: reqwest::Response) -> Self {
+        assert_eq!(response.status(), 200, "{}", response.url());
         assert_eq!(response.headers()["content-type"], "text/event-stream");
         assert_eq!(response.headers()["cache-control"], "no-store");
         Self { response, text: String::new() }
     }
 
     /// The next event, its name and what it tells; nothing at the end.
-    async fn next(&mut self) -> Option<(String, Json)> {
+    pub(crate) async fn next(&mut self) -> Option<(String, Json)> {
         loop {
             while let Some(end) = self.text.find("\n\n") {
                 let event: String = self.text.drain(..end + 2).collect();
