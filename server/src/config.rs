@@ -107,14 +107,13 @@ pub struct Config {
     #[arg(long, env = "GATSBI_TENANT_MAX_KEPT_MIB", value_name = "N", help_heading = "Access")]
     pub tenant_max_kept_mib: Option<u64>,
 
-    /// Blocks that are computed at the same time on a CPU, each by threads of its own. Many candidates or many robots
-    /// want as many as there are idle cores; a lone robot gains nothing.
-    #[arg(long, env = "GATSBI_WORKERS", default_value_t = 1, help_heading = "Engine")]
+    /// Blocks that are computed at the same time on a CPU, each by threads of its own: what many candidates and many
+    /// robots are answered with. More than there are idle cores makes every step slower; 0 takes half of the cores.
+    #[arg(long, env = "GATSBI_WORKERS", default_value_t = 0, help_heading = "Engine")]
     pub workers: usize,
 
-    /// CPU threads of one operation. More than there are idle cores makes every step slower; 0 takes half of the
-    /// cores.
-    #[arg(long, env = "GATSBI_THREADS", default_value_t = 0, help_heading = "Engine")]
+    /// CPU threads of one operation. Workers use cores better; 0 takes half of the cores.
+    #[arg(long, env = "GATSBI_THREADS", default_value_t = 1, help_heading = "Engine")]
     pub threads: usize,
 
     /// Rows of an observe block. 1 answers a lone robot fastest; a GPU wants 16 or so. Changing it changes answers
@@ -344,7 +343,7 @@ impl Config {
             "--otlp-endpoint needs a server that was built with the feature otel".to_owned(),
         );
         for (flag, value, range) in [
-            ("--workers", self.workers, 1..=1024),
+            ("--workers", self.workers, 0..=1024),
             ("--threads", self.threads, 0..=1024),
             ("--observe-block", self.observe_block, 1..=1024),
             ("--imagine-block", self.imagine_block, 1..=1024),
@@ -415,9 +414,12 @@ impl Config {
     /// Sizes of the engine.
     pub fn engine(&self) -> EngineConfig {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let or_half = |count: usize| if count == 0 { (cores / 2).max(1) } else { count };
+        let cuda = matches!(self.device.0, tch::Device::Cuda(_));
         EngineConfig {
-            workers: self.workers,
-            threads: if self.threads == 0 { (cores / 2).max(1) } else { self.threads },
+            // A GPU computes one block after the other anyway.
+            workers: if cuda { 1 } else { or_half(self.workers) },
+            threads: or_half(self.threads),
             sizes: Sizes {
                 observe_block: self.observe_block,
                 imagine_block: self.imagine_block,
