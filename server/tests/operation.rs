@@ -335,6 +335,6 @@ fn requests_that_do_not_end_keep_the_server_no_longer_than_said() {
     let ended = server.child.wait().unwrap();
     assert!(ended.success(), "{ended}: {}", server.log());
     let took = told.elapsed();
-    assert!(took >= Duration::from_secs(6) && took < Duration::from_secs(11), "{took:?}");
+    assert!(took >= Duration::from_secs(6) && took < Duration::from_secs(12), "{took:?}");
     assert!(server.log().contains("requests were cut off"), "{}", server.log());
 }
