@@ -48,6 +48,7 @@ pub struct App {
     stop: CancellationToken,
     ready: watch::Sender<Option<Arc<Service>>>,
     tasks: JoinSet<Result<(), String>>,
+    engine: Engine,
     engine_ended: watch::Receiver<bool>,
     drain: Duration,
 }
@@ -177,7 +178,7 @@ impl App {
             ended.send_replace(true);
         });
 
-        let service = Arc::new(Service::new(engine, models, &config, stop.clone()));
+        let service = Arc::new(Service::new(engine.clone(), models, &config, stop.clone()));
         let watched = (Arc::downgrade(&service), tls.clone());
         tasks.spawn(sweep(watched, metrics, stop.clone()));
         let of = Arc::clone(&service);
@@ -190,7 +191,7 @@ impl App {
             routes(Arc::clone(&service), access.clone()).await.map_err(StartError::Routes)?;
         tasks.spawn(self::grpc(grpc_listener, routes, stop.clone()));
         ready.send_replace(Some(service));
-        Ok(Self { grpc, http, admin, access, tls, stop, ready, tasks, engine_ended, drain })
+        Ok(Self { grpc, http, admin, access, tls, stop, ready, tasks, engine, engine_ended, drain })
     }
 
     /// The keys in force, if there are any.
@@ -224,8 +225,15 @@ impl App {
             tracing::warn!(seconds = self.drain.as_secs(), "requests were cut off");
             self.tasks.shutdown().await;
         }
-        // Connections that outlive their server hold on to the engine; the process does not wait for them.
-        tokio::time::timeout(ENGINE_END, self.engine_ended()).await.ok();
+        // Connections that outlive their server hold on to the engine. It must not compute any more when the process ends:
+        // libtorch's globals go first.
+        let ended = async {
+            self.engine.stop().await;
+            self.engine_ended().await;
+        };
+        if tokio::time::timeout(ENGINE_END, ended).await.is_err() {
+            tracing::warn!("the engine has not ended");
+        }
     }
 }
 

@@ -7,12 +7,52 @@ mod checkpoint;
 use std::{
     io::{BufRead as _, BufReader, Read as _},
     process::{Command, Stdio},
+    thread::sleep,
+    time::{Duration, Instant},
 };
 
 use checkpoint::checkpoint;
 use serde_json::{Value as Json, json};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_gatsbi-server");
+
+/// Status and text of an answer, if one comes.
+fn get(url: &str) -> reqwest::Result<(u16, String)> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let response = reqwest::get(url).await?;
+        Ok((response.status().as_u16(), response.text().await?))
+    })
+}
+
+#[test]
+fn it_is_alive_but_not_ready_while_its_models_load() {
+    let folder = tempfile::tempdir().unwrap();
+    // Nobody writes, so whoever reads it waits.
+    let slow = folder.path().join("slow.safetensors");
+    assert!(Command::new("mkfifo").arg(&slow).status().unwrap().success());
+    let admin = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let mut server = Command::new(PROGRAM)
+        .args(["--grpc-listen", "127.0.0.1:0", "--http-listen", "127.0.0.1:0"])
+        .args(["--admin-listen", &admin.to_string(), "--checkpoint"])
+        .arg(&slow)
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let until = Instant::now() + Duration::from_secs(30);
+    let alive = loop {
+        match get(&format!("http://{admin}/healthz")) {
+            Ok(answer) => break answer,
+            Err(error) => assert!(Instant::now() < until, "{error}"),
+        }
+        sleep(Duration::from_millis(20));
+    };
+    let ready = get(&format!("http://{admin}/readyz"));
+    server.kill().unwrap();
+    server.wait().unwrap();
+    assert_eq!(alive.0, 200);
+    assert_eq!(ready.unwrap(), (503, "not ready\n".to_owned()));
+}
 
 #[test]
 fn it_serves_until_it_is_told_to_end() {
@@ -42,15 +82,8 @@ fn it_serves_until_it_is_told_to_end() {
         environment.contains("GOMP_SPINCOUNT=0") && environment.contains("OMP_WAIT_POLICY=PASSIVE")
     );
 
-    let get = |url: String| {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        runtime.block_on(async {
-            let response = reqwest::get(url).await.unwrap();
-            (response.status().as_u16(), response.text().await.unwrap())
-        })
-    };
-    assert_eq!(get(format!("http://{}/readyz", address("admin"))).0, 200);
-    let (status, models) = get(format!("http://{}/v1/models", address("http")));
+    assert_eq!(get(&format!("http://{}/readyz", address("admin"))).unwrap().0, 200);
+    let (status, models) = get(&format!("http://{}/v1/models", address("http"))).unwrap();
     assert_eq!(status, 200);
     assert!(models.contains("\"name\":\"arm\""), "{models}");
 

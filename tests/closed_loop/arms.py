@@ -14,19 +14,15 @@ import numpy as np
 from gatsbi_client import Cem, Client, Icem as ServiceIcem, Session, costs
 from gatsbi_sim import Observation, Simulator
 
-from goals import SIZE, Goal, Table, in_image
+from goals import LOST, SIZE, Goal, Table, in_image, unready
 from search import Array, Budget, Icem
 
 REACH = 0.06
 """Largest displacement of the hand in a step, metres; the data sets' pushes reach 0.068."""
 HAND_WEIGHT = 1.0
 """How much it counts, a metre, that the hand is not behind the object yet."""
-AROUND = 0.09
-"""Distance at which the hand goes around an object, metres."""
 LAST_WEIGHT = 2.0
 """How much the last step counts beside the mean of all."""
-LOST = 0.25
-"""An object that was seen more than this far from where it was before is another one."""
 
 
 class Arm(Protocol):
@@ -88,7 +84,7 @@ class _Searching:
     def decide(self) -> tuple[list[float], dict[str, Any]]:
         began = time.monotonic()
         at = self._where()
-        place = self._table.metres(at)
+        place, target = self._table.metres(at), np.array(self._goal.target)
         best: tuple[float, list[float]] = (np.inf, [])
 
         def cost(displacements: Array) -> Array:
@@ -96,7 +92,7 @@ class _Searching:
             moves = self._scene.hand_moves(displacements)
             actions = [[step["action"] for step in way] for way in moves]
             hands = np.array([[step["position"][:2] for step in way] for way in moves])
-            total = self._left(np.array(actions)) + HAND_WEIGHT * self._unready(hands, place).min(axis=1)
+            total = self._left(np.array(actions)) + HAND_WEIGHT * unready(hands, place, target).min(axis=1)
             first = int(total.argmin())
             if total[first] < best[0]:
                 best = (float(total[first]), actions[first][0])
@@ -106,13 +102,6 @@ class _Searching:
         least, action = best
         told = {"steps": self._budget.steps, "seconds": time.monotonic() - began, "cost": least}
         return action, told | {"at": at.tolist()}
-
-    def _unready(self, hands: Array, place: Array) -> Array:
-        """How far hands `[..., 2]` have to go around the object, to its side away from the target; metres."""
-        way, hands = np.array(self._goal.target) - place, hands - place
-        cosine = -(hands @ way) / np.maximum(np.linalg.norm(hands, axis=-1) * np.linalg.norm(way), 1e-9)
-        around = AROUND * np.arccos(cosine.clip(-1, 1))
-        return np.hypot(np.maximum(np.linalg.norm(hands, axis=-1) - AROUND, 0), around)
 
     def _where(self) -> Array:
         """Where the object is now, in [-1, 1]."""

@@ -18,6 +18,12 @@ TARGET_MARGIN, BEGIN_MARGIN, CLEARANCE = 0.08, 0.04, 0.09
 BEGIN = 0.1
 """Distance behind an object at which a push begins."""
 DISTANCES = (0.08, 0.14)
+TRIES = 1000
+"""In vain, after which a goal without room is taken."""
+AROUND = 0.09
+"""Distance at which the hand goes around an object, metres."""
+LOST = 0.25
+"""An object that was seen more than this far from where it was before is another one; half the picture's side is 1."""
 SUCCESS = 0.03
 """An object this near to its target is there; metres."""
 
@@ -45,23 +51,33 @@ def draw(scene: Simulator, number: int) -> Goal:
     """The goal of this number."""
     rng, seed = np.random.default_rng([7, number]), FIRST_SEED + number
     places = np.array([each["position"][:2] for each in scene.reset(seed).state["objects"]])
-    while True:
-        named = int(rng.integers(len(places)))
-        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*DISTANCES)
-        along = np.array([np.cos(angle), np.sin(angle)])
-        target, begin = places[named] + along * distance, places[named] - along * BEGIN
-        if roomy(places, named, target, begin):
-            break
+    named, target, distance = pick(places, rng)
     shown = scene.set_goal([target if each == named else None for each in range(len(places))])
     pixel = shown.state["objects"][named]["pixel"]
     return Goal(number, seed, named, (float(target[0]), float(target[1])), (pixel[0], pixel[1]), distance)
 
 
-def roomy(places: np.ndarray, named: int, target: np.ndarray, begin: np.ndarray) -> bool:
-    """Whether an object of those at `[n, 2]` has room at its target, and the hand where the push begins."""
-    others = np.delete(places, named, axis=0)
-    clear = bool((np.linalg.norm(others[:, None] - [target, begin], axis=-1) > CLEARANCE).all())
-    return clear and _inside(target, TARGET_MARGIN) and _inside(begin, BEGIN_MARGIN)
+def pick(places: np.ndarray, rng: np.random.Generator) -> tuple[int, np.ndarray, float]:
+    """Which of the objects at `[n, 2]` metres is pushed, where to, and how far: with room for it at the target and for
+    the hand where the push begins, if there is any."""
+    for _ in range(TRIES):
+        named = int(rng.integers(len(places)))
+        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*DISTANCES)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        target, begin = places[named] + along * distance, places[named] - along * BEGIN
+        others = np.delete(places, named, axis=0)
+        clear = (np.linalg.norm(others[:, None] - [target, begin], axis=-1) > CLEARANCE).all()
+        if clear and _inside(target, TARGET_MARGIN) and _inside(begin, BEGIN_MARGIN):
+            break
+    return named, target, distance
+
+
+def unready(hands: np.ndarray, place: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """How far hands `[..., 2]` have to go around an object, to its side away from the target; metres."""
+    way, hands = target - place, hands - place
+    far, left = np.linalg.norm(hands, axis=-1), np.linalg.norm(way, axis=-1)
+    cosine = -(hands * way).sum(axis=-1) / np.maximum(far * left, 1e-9)
+    return np.hypot(np.maximum(far - AROUND, 0), AROUND * np.arccos(cosine.clip(-1, 1)))
 
 
 def in_image(pixel: object) -> np.ndarray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from goals import CENTRE, HALF
+
 Array = np.ndarray
 
 PERIOD = 0.2
@@ -12,9 +14,8 @@ FASTEST = 2.1
 """Joints are slowed down together to this, rad/s."""
 HEIGHT = 0.03
 """Of the point between the fingertips over the table, metres."""
-# The tray of push1, and how far the hand stays from its rim; metres.
-CENTRE, HALF = np.array([0.52, 0.0]), np.array([0.24, 0.28])
 MARGIN = 0.035
+"""How far it stays from the tray's rim, metres."""
 HOME = np.array([0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.785])
 # Each joint's frame in the one before: its origin, and the turn about x in quarters.
 ORIGINS = np.array([

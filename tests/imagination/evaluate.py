@@ -23,15 +23,13 @@ from PIL import Image, ImageDraw
 from stable_baselines3 import PPO
 
 import robot
-from goals import SCENE, SIZE
+from goals import FIRST_SEED, SCENE, SIZE
 from report import mean
 from robot import RobotTask
 from run import ROOT, Server
 from train import TASKS
 
 Array = np.ndarray
-FIRST_SEED = 900_000
-"""Of episodes; none of them was trained on."""
 ARMS = ("nothing", "random", "policy")
 SHOWN = 3
 """Episodes of an arm in the picture."""

@@ -17,13 +17,8 @@ import goals
 from robot import Beginning, Robots, begin
 
 Array = np.ndarray
-AROUND = 0.09
-"""Distance at which the hand goes around an object, metres."""
 UNREADY_WEIGHT = 0.5
 """What a metre of the hand's way to behind the object counts beside one of the object's."""
-LOST = 0.25
-"""An object that was seen more than this far from where it was before is another one; half the picture's side is 1."""
-TRIES = 50
 
 
 class Push:
@@ -44,12 +39,12 @@ class Push:
         # Where a first imagined step has lost all objects, any will do.
         here |= ~here.any(axis=1, keepdims=True)
         places = self._table.metres(outputs["objects"][..., 1:3])
-        drawn = [drawn_goal(places[row, here[row]], rng) for row in range(len(starts))]
-        named = [np.flatnonzero(here[row])[which] for row, (which, _) in enumerate(drawn)]
+        drawn = [goals.pick(places[row, here[row]], rng) for row in range(len(starts))]
+        named = [np.flatnonzero(here[row])[which] for row, (which, _, _) in enumerate(drawn)]
         rows = np.arange(len(starts))
         self._ids = outputs["object_ids"][rows, named]
         self._at = outputs["objects"][rows, named, 1:3].astype(float)
-        self.goals = np.array([goal for _, goal in drawn])
+        self.goals = np.array([goal for _, goal, _ in drawn])
 
     def act(self, actions: Array) -> Array:
         along, across = self._frame()
@@ -63,17 +58,14 @@ class Push:
         sides = np.stack([(hand * along).sum(axis=1), (hand * across).sum(axis=1)], axis=1)
         far = np.linalg.norm(sides, axis=1, keepdims=True)
         left = np.linalg.norm(self.goals - self._table.metres(self._at), axis=1, keepdims=True)
-        seen = [10 * sides, 10 * (far - AROUND), sides / np.maximum(far, 1e-6), 10 * left, np.abs(10 * sides[:, 1:])]
+        seen = [10 * sides, 10 * (far - goals.AROUND), sides / np.maximum(far, 1e-6), 10 * left, np.abs(10 * sides[:, 1:])]
         return np.concatenate(seen, axis=1).clip(-10, 10).astype(np.float32)
 
     def reward(self, outputs: Mapping[str, Array], actions: Array) -> Array:
         self._follow(outputs)
         place = self._table.metres(self._at)
-        way, hands = self.goals - place, self.robots.hands - place
-        far, left = np.linalg.norm(hands, axis=1), np.linalg.norm(way, axis=1)
-        cosine = -(hands * way).sum(axis=1) / np.maximum(far * left, 1e-9)
-        unready = np.hypot(np.maximum(far - AROUND, 0), AROUND * np.arccos(cosine.clip(-1, 1)))
-        return -10 * (left + UNREADY_WEIGHT * unready)
+        left = np.linalg.norm(self.goals - place, axis=1)
+        return -10 * (left + UNREADY_WEIGHT * goals.unready(self.robots.hands, place, self.goals))
 
     def _frame(self) -> tuple[Array, Array]:
         """Unit vectors `[rows, 2]` from the object to the goal, and to the left of that."""
@@ -88,7 +80,7 @@ class Push:
             found = here[ids[here] == self._ids[row]]
             if len(found) == 0 and len(here):
                 distances = np.linalg.norm(table[here, 1:3] - self._at[row], axis=1)
-                found = here[[distances.argmin()]] if distances.min() < LOST else found
+                found = here[[distances.argmin()]] if distances.min() < goals.LOST else found
             if len(found):
                 self._ids[row], self._at[row] = ids[found[0]], table[found[0], 1:3]
 
@@ -103,7 +95,7 @@ class Push:
         """The goal of an episode in the simulator: where its object is in the picture, and the place to bring it to."""
         now, _ = begin(scene, None, seed)
         at = self.truth(now)["objects"][0, :, 1:3]
-        which, goal = drawn_goal(self._table.metres(at), np.random.default_rng([7, seed]))
+        which, goal, _ = goals.pick(self._table.metres(at), np.random.default_rng([7, seed]))
         return at[which], goal
 
     def pursue(self, goal: tuple[Array, Array], beginning: Beginning, outputs: Mapping[str, Array]) -> None:
@@ -120,15 +112,3 @@ class Push:
     def mark(self) -> Array:
         """Where the first row's goal is in the picture."""
         return self._table.picture(self.goals[0])
-
-
-def drawn_goal(places: Array, rng: np.random.Generator) -> tuple[int, Array]:
-    """Which of the objects at `[n, 2]` metres shall go where: with room for it and for the hand, if there is any."""
-    for _ in range(TRIES):
-        named = int(rng.integers(len(places)))
-        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(*goals.DISTANCES)
-        along = np.array([np.cos(angle), np.sin(angle)])
-        target = places[named] + along * distance
-        if goals.roomy(places, named, target, places[named] - along * goals.BEGIN):
-            break
-    return named, target

@@ -15,12 +15,11 @@ from gatsbi_client.gym import Task
 from gatsbi_sim import Observation, Simulator
 
 import arm
+from arms import REACH
 from search import Budget, Icem
 
 Array = np.ndarray
 
-REACH = 0.06
-"""Largest displacement of a hand along an axis in a step, metres."""
 FRAMES = 5
 """Frames that are seen before an episode begins; the hand is moved by chance between them."""
 

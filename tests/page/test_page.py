@@ -267,6 +267,17 @@ def test_a_key_is_asked_for_kept_and_sent(open_page, server):
         page.wait_for_timeout(20)
 
 
+def test_the_api_page_is_here_too(open_page, shots):
+    # A style in its library's own page is refused by the policy, and not missed.
+    page = open_page("docs/", expected=["Applying inline style violates"])
+    operation = page.locator("#operations-ModelService-ListModels")
+    operation.get_by_role("button").first.click()
+    operation.get_by_role("button", name="Try it out").click()
+    operation.get_by_role("button", name="Execute").click()
+    expect(operation.locator(".live-responses-table")).to_contain_text("push1-tiny")
+    page.screenshot(path=shots / "docs.png")
+
+
 def test_a_session_that_is_closed_says_so(open_page, server):
     session = json.loads(server.gatsbi("session", "new"))["id"]
     page = open_page(f"#/sessions/{session}", expected=["404"])
@@ -307,8 +318,8 @@ def test_it_keeps_up_with_ten_steps_a_second(open_page, server, episode):
     told = lambda times: f"median {statistics.median(times):.0f} ms, 95th percentile {times[int(0.95 * (len(times) - 1))]:.0f} ms"
     print(f"{len(frames)} steps in {took:.1f} s, {len(drawn)} drawn; from the observation's answer to the picture: {told(waits)}; "
           f"from the belief in the server: {told(whole)}")
-    # Where others use the processor steps are skipped, but few, and nothing piles up.
-    assert len(drawn) >= 0.5 * len(frames)
+    assert len(drawn) >= 0.8 * len(frames)
+    # Nothing piles up, even where a step itself takes a second because others use the processor.
     assert waits[int(0.95 * (len(waits) - 1))] < 1000
 
 

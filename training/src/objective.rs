@@ -225,9 +225,8 @@ fn add_scene(
         add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
         if let (Some(objects), Some(rendering)) = (objects, &rendering) {
             add_composite(terms, objects, rendering, &seen.mixture, frame, moment.step, phase);
-            if t > 0 {
-                add_following(terms, model, objects, (&state, &seen.mixture), frame, moment.step);
-            }
+            let at = (moment.step, t > 0);
+            add_places(terms, model, objects, (&state, &seen.mixture), frame, at);
             if let Some(found) = &seen.objects {
                 add_objects_kl(terms, model, objects, found, &first, moment.step);
             }
@@ -362,29 +361,30 @@ fn add_composite(
 /// How near discovery must find an object to draw it, in pixels: less than the distance of neighbours.
 const FOLLOWING_REACH: f64 = 3.0;
 
-/// Leads followed and imagined objects to what discovery finds.
-fn add_following(
+/// Leads followed and imagined objects to what discovery finds, and what is drawn of objects to the centres of their boxes.
+fn add_places(
     terms: &mut Terms,
     model: &Gatsbi,
     recipe: &ObjectRecipe,
     (state, mixture): (&GatsbiState, &MixtureStep),
     frame: &Tensor,
-    step: u64,
+    (step, known): (u64, bool),
 ) {
-    let weight = recipe.following.at(step);
-    if weight > 0.0 {
-        let place = |z: &Tensor| {
-            let pixels = model.config().image_size as f64 / 2.0;
-            (z.narrow(-1, 0, 1), model.objects().drawn_centres(z) * pixels)
-        };
+    let (following, centring) = (recipe.following.at(step), recipe.centring.at(step));
+    let following = if known { following } else { 0.0 };
+    if following == 0.0 && centring == 0.0 {
+        return;
+    }
+    let pixels = model.config().image_size as f64 / 2.0;
+    let objects = model.objects().placed(&state.objects.z);
+    terms.add("centring", loss::centring(&objects) * pixels.powi(2), centring);
+    if following > 0.0 {
         let found = {
             let _no_grad = tch::no_grad_guard();
-            place(&model.objects().detect(frame, &mixture.mu_mix))
+            model.objects().placed(&model.objects().detect(frame, &mixture.mu_mix))
         };
-        let objects = place(&state.objects.z);
-        let distance =
-            loss::following((&objects.0, &objects.1), (&found.0, &found.1), FOLLOWING_REACH);
-        terms.add("following", distance, weight);
+        let distance = loss::following(&objects, &found, FOLLOWING_REACH / pixels);
+        terms.add("following", distance * pixels.powi(2), following);
     }
 }
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::variant::Variant;
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 10] = [
+const NAMED: [(&str, &str); 11] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -22,6 +22,7 @@ const NAMED: [(&str, &str); 10] = [
     ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
     ("tiny-finish", include_str!("../recipes/tiny-finish.toml")),
     ("tiny-long", include_str!("../recipes/tiny-long.toml")),
+    ("tiny-centre", include_str!("../recipes/tiny-centre.toml")),
 ];
 
 /// How a model is trained.
@@ -213,6 +214,10 @@ pub struct ObjectRecipe {
     /// learn them from the likelihood.
     #[serde(default)]
     pub following: Ramp,
+    /// Weight, in nats a squared pixel, of the distance between what is drawn of an object and the centre of its box:
+    /// nothing else holds a box to its object once following leads what is drawn.
+    #[serde(default)]
+    pub centring: Ramp,
     /// Mean of the raw scale in the discovery prior.
     pub scale_mean: Ramp,
 }
@@ -337,9 +342,6 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(
-            error.contains("balls, tiny, tiny-refine, tiny-objects, tiny-finish, tiny-long"),
-            "{error}"
-        );
+        assert!(error.contains("tiny-objects, tiny-finish, tiny-long, tiny-centre"), "{error}");
     }
 }

@@ -224,6 +224,17 @@ impl Tools<'_> {
     fn checkpoint(&self, preset: &str) -> PathBuf {
         self.folder.path().join(preset)
     }
+
+    /// Loads the service at `url`, or the peer of that name.
+    fn load(&self, peer: Option<&str>, url: &str) -> Result<Side> {
+        let mut command = Command::new(self.programs.named("gatsbi-load")?);
+        command.args(["turns", "--server", url]);
+        if let Some(peer) = peer {
+            // It is asked again and again while the peer starts.
+            command.args(["--peer", peer]).stderr(Stdio::null());
+        }
+        Side::start("the load", &mut command)
+    }
 }
 
 impl fmt::Display for Line {

@@ -3,7 +3,7 @@
 
 use tch::{Kind, Tensor};
 
-use super::mixture::MixtureStep;
+use super::{mixture::MixtureStep, objects::Placed};
 use crate::nn::{Normal, distributions::normal_log_density};
 
 /// Keeps logarithms of alpha and its complement finite.
@@ -80,23 +80,27 @@ pub fn keypoint_regression(gamma: &Tensor, agent_mask: &Tensor) -> Tensor {
     sum(&(gamma - agent_mask).square())
 }
 
-/// Objects somewhere in an image: presence `[B, N, 1]` and centres `[B, N, 2]` in pixels.
-pub type Placed<'a> = (&'a Tensor, &'a Tensor);
-
-/// Squared distances in pixels between objects and where discovery finds them, `[B]`, summed over objects as far as they
-/// are present.
+/// Squared distances between where objects are drawn and where discovery draws them, `[B]`, summed over objects as far as
+/// they are present.
 ///
-/// An object is drawn to the detections within some `reach` pixels of it, the nearest most; one without any near it pays
-/// nothing. Only the objects' centres get a gradient.
-pub fn following(objects: Placed<'_>, found: Placed<'_>, reach: f64) -> Tensor {
-    let offset = objects.1.unsqueeze(2) - found.1.detach().unsqueeze(1); // [B, N, D, 2]
+/// An object is drawn to the detections within some `reach` of it, the nearest most; one without any near it pays nothing.
+/// Distances are in units of the image's half side. Only the objects' centres get a gradient.
+pub fn following(objects: &Placed, found: &Placed, reach: f64) -> Tensor {
+    let drawn = |placed: &Placed| &placed.centre + placed.offset.detach();
+    let offset = drawn(objects).unsqueeze(2) - drawn(found).detach().unsqueeze(1); // [B, N, D, 2]
     let distance = offset.square().sum_dim_intlist(-1, false, Kind::Float);
-    let detected = found.0.detach().transpose(1, 2); // [B, 1, D]
+    let detected = found.presence.detach().transpose(1, 2); // [B, 1, D]
     let near = (distance.detach() * (-0.5 / (reach * reach))).exp() * detected;
     // As much as a detection at twice the reach: beyond it the weights fade.
     let nowhere = (-2.0_f64).exp();
     let weight = &near / (near.sum_dim_intlist(-1, true, Kind::Float) + nowhere);
-    sum(&(weight * distance * objects.0.detach()))
+    sum(&(weight * distance * objects.presence.detach()))
+}
+
+/// Squared distances between where objects are drawn and the centres of their boxes, `[B]`, in units of the image's half
+/// side, summed over objects as far as they are present. Only what is drawn gets a gradient.
+pub fn centring(objects: &Placed) -> Tensor {
+    sum(&(objects.offset.square() * objects.presence.detach()))
 }
 
 /// Sum over everything but the batch.
@@ -110,25 +114,38 @@ mod tests {
 
     use super::*;
 
+    /// Objects given as presence, centre x, y, offset x, y.
+    fn placed(objects: &[[f32; 5]]) -> Placed {
+        let all = Tensor::from_slice(&objects.concat()).view([1, -1, 5]);
+        let part = |from, width| all.narrow(-1, from, width).copy();
+        Placed { presence: part(0, 1), centre: part(1, 2), offset: part(3, 2) }
+    }
+
     #[test]
     fn an_object_is_drawn_to_what_is_found_near_it() {
-        let placed = |objects: &[[f32; 3]]| {
-            let all = Tensor::from_slice(&objects.concat()).view([1, -1, 3]);
-            (all.narrow(-1, 0, 1), all.narrow(-1, 1, 2).copy())
-        };
-        // One object two pixels left of a detection, one far from all, one absent.
-        let (presence, centres) = placed(&[[1.0, 32.0, 20.0], [1.0, 3.0, 20.0], [0.0, 33.0, 20.0]]);
-        let centres = centres.set_requires_grad(true);
-        let (detected, found) = placed(&[[1.0, 34.0, 20.0], [0.0, 31.0, 20.0]]);
-        let loss = following((&presence, &centres), (&detected, &found), 4.0);
+        // One object drawn two units left of a detection, one far from all, one absent.
+        let mut objects = placed(&[
+            [1.0, 33.0, 20.0, -1.0, 0.0],
+            [1.0, 3.0, 20.0, 0.0, 0.0],
+            [0.0, 33.0, 20.0, 0.0, 0.0],
+        ]);
+        objects.centre = objects.centre.set_requires_grad(true);
+        let found = placed(&[[1.0, 36.0, 20.0, -2.0, 0.0], [0.0, 31.0, 20.0, 0.0, 0.0]]);
+        let loss = following(&objects, &found, 4.0);
         let near = (-0.5_f64 * 4.0 / 16.0).exp();
         let weight = near / (near + (-2.0_f64).exp());
         assert!((loss.double_value(&[0]) - 4.0 * weight).abs() < 1e-3, "{loss}");
         loss.sum(Kind::Float).backward();
-        let gradient = centres.grad();
+        let gradient = objects.centre.grad();
         let of = |object: i64| gradient.double_value(&[0, object, 0]);
         assert!((of(0) + 4.0 * weight).abs() < 1e-3, "{gradient}");
         assert!(of(1).abs() < 1e-3 && of(2).abs() < 1e-6, "{gradient}");
+    }
+
+    #[test]
+    fn what_is_drawn_beside_the_centre_of_its_box_pays_as_far_as_it_is_present() {
+        let loss = centring(&placed(&[[1.0, 5.0, 6.0, 3.0, 4.0], [0.5, 5.0, 6.0, 0.0, 2.0]]));
+        assert!((loss.double_value(&[0]) - 27.0).abs() < 1e-5, "{loss}");
     }
 
     #[test]

@@ -255,6 +255,8 @@ pub(super) enum Command {
     Serve(Newcomer),
     /// Nobody uses some model any more.
     Unused,
+    /// The thread shall end, whatever it has to do.
+    Stop,
 }
 
 /// A request with the way back, the room it takes in the queue, and the span it belongs to.

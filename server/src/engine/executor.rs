@@ -35,6 +35,7 @@ pub(super) struct Executor {
     door: Arc<Door>,
     config: EngineConfig,
     next_job: u64,
+    stopped: bool,
 }
 
 impl Executor {
@@ -43,12 +44,12 @@ impl Executor {
         door: Arc<Door>,
         commands: mpsc::Receiver<Command>,
     ) -> Self {
-        Self { served: BTreeMap::new(), commands, door, config, next_job: 0 }
+        Self { served: BTreeMap::new(), commands, door, config, next_job: 0, stopped: false }
     }
 
-    /// Works until nobody can ask any more.
+    /// Works until nobody can ask any more, or it is stopped.
     pub(super) fn run(mut self) {
-        loop {
+        while !self.stopped {
             self.forget_unused_models();
             if self.served.values().all(|served| served.scheduler().is_idle()) {
                 match self.commands.blocking_recv() {
@@ -97,6 +98,7 @@ impl Executor {
                 self.served.insert(id, Served::new(newcomer, sizes, Arc::clone(&self.door)));
             }
             Command::Unused => {}
+            Command::Stop => self.stopped = true,
         }
     }
 

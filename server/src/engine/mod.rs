@@ -139,6 +139,13 @@ impl Engine {
         Ok(entry)
     }
 
+    /// Ends the thread before the last handle is gone, after the blocks that are being computed: requests on their way
+    /// get no answer.
+    pub async fn stop(&self) {
+        // If it has ended already, there is nobody to hear it.
+        self.commands.send(Command::Stop).await.ok();
+    }
+
     /// The most that a bulk rollout may be, in rows and bytes of outputs.
     pub fn bulk_limit(&self) -> (u32, u64) {
         Door::bulk_limit(self.config.door)

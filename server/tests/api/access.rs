@@ -4,7 +4,7 @@
 
 use std::time::{Duration, SystemTime};
 
-use gatsbi_proto::v1;
+use gatsbi_proto::v1::{self, session_service_client::SessionServiceClient};
 use gatsbi_server::{
     access::{
         key::{Role, new_secret},
@@ -295,6 +295,11 @@ async fn what_is_anothers_looks_as_if_it_did_not_exist() {
     assert_eq!(rivals["sessions"].as_array().map_or(0, Vec::len), 0, "{rivals}");
     let own: Json = listed(&guarded.read).await.unwrap().json().await.unwrap();
     assert!(own["sessions"].as_array().unwrap().len() > 10);
+    let mut sessions = SessionServiceClient::new(guarded.grpc.clone());
+    let mut call = tonic::Request::new(v1::ListSessionsRequest::default());
+    let key = format!("Bearer {}", guarded.rival).parse().unwrap();
+    call.metadata_mut().insert("authorization", key);
+    assert!(sessions.list_sessions(call).await.unwrap().into_inner().sessions.is_empty());
     let overview = async |key: &str| {
         let feed = guarded.server.get("/v1/live?thumbnails=true").bearer_auth(key).send().await;
         let (name, told) = Feed::of(feed.unwrap()).next().await.unwrap();

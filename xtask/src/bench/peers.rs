@@ -59,7 +59,7 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
         .arg(&place.checkpoint);
     let log = tools.folder.path().join("server.log");
     let server = Server::start(&mut server, &log, &tools.interrupt)?;
-    let mut ours = load(tools, None, &server.grpc)?;
+    let mut ours = tools.load(None, &server.grpc)?;
     let mut peers = BTreeMap::new();
     for name in PEERS {
         progress(&format!("starting {name}"));
@@ -173,7 +173,7 @@ impl Place {
         let began = Instant::now();
         loop {
             tools.interrupt.check()?;
-            let mut load = load(tools, Some(name), &url)?;
+            let mut load = tools.load(Some(name), &url)?;
             match load.ask("observe 1 0") {
                 Ok(_) => return Ok(Peer { load, process: Some(process) }),
                 Err(error) if began.elapsed() > PATIENCE || process.child.try_wait()?.is_some() => {
@@ -237,16 +237,6 @@ fn make(venv: &Path, sources: &Path) -> Result<()> {
         ensure!(status.success(), "{} failed ({status})", command.get_program().display());
     }
     Ok(())
-}
-
-/// Loads a peer, or the service where none is named.
-fn load(tools: &Tools<'_>, peer: Option<&str>, url: &str) -> Result<Side> {
-    let mut command = Command::new(tools.programs.named("gatsbi-load")?);
-    command.args(["turns", "--server", url]).stderr(Stdio::null());
-    if let Some(peer) = peer {
-        command.args(["--peer", peer]);
-    }
-    Side::start("the load", &mut command)
 }
 
 #[cfg(test)]

@@ -29,8 +29,8 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
     null.args(["null", "--threads", "1", "--max-sessions", "100000"]);
     let log = tools.folder.path().join("null.log");
     let null = Server::start(&mut null, &log, &tools.interrupt)?;
-    let mut at_served = load(tools, &served)?;
-    let mut at_null = load(tools, &null)?;
+    let mut at_served = tools.load(None, &served.grpc)?;
+    let mut at_null = tools.load(None, &null.grpc)?;
 
     let mut found: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for round in 0..=arguments.rounds {
@@ -65,10 +65,4 @@ pub(super) fn measure(tools: &Tools<'_>, arguments: &Arguments) -> Result<BTreeM
     served.process.stop()?;
     null.process.stop()?;
     Ok(found.into_iter().map(|(name, figures)| (name, median(figures))).collect())
-}
-
-fn load(tools: &Tools<'_>, server: &Server) -> Result<Side> {
-    let mut command = Command::new(tools.programs.named("gatsbi-load")?);
-    command.args(["turns", "--server", &server.grpc]);
-    Side::start("the load", &mut command)
 }

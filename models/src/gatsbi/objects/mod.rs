@@ -17,7 +17,10 @@ mod surroundings;
 
 use tch::{Kind, Tensor};
 
-pub use self::{render::Rendering, surroundings::Agent};
+pub use self::{
+    render::{Placed, Rendering},
+    surroundings::Agent,
+};
 
 use self::{
     discovery::{Discovered, Discovery},
@@ -278,10 +281,9 @@ impl ObjectModule {
         self.discovery.posterior(&discovery::input(frame, mu_mix), &nothing, &noise, false).z
     }
 
-    /// Centres x, y in [-1, 1] of what is drawn in the boxes of objects `z [B, N, Z]`, `[B, N, 2]`: a box need not be
-    /// centred on its object. Their gradient is that of the boxes' centres.
-    pub fn drawn_centres(&self, z: &Tensor) -> Tensor {
-        render::drawn_centres(&self.decoder, z, self.layout)
+    /// Where objects `z [B, N, Z]` are.
+    pub fn placed(&self, z: &Tensor) -> Placed {
+        render::placed(&self.decoder, z, self.layout)
     }
 
     /// Draws objects `z [B, N, Z]` into images.

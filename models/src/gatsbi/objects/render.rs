@@ -22,6 +22,17 @@ pub struct Rendering {
     pub masks: Tensor,
 }
 
+/// Where objects are, in units of the image's half side from its centre. A box need not be centred on its object.
+#[derive(Debug)]
+pub struct Placed {
+    /// Presence, `[B, N, 1]`.
+    pub presence: Tensor,
+    /// Centres of boxes, `[B, N, 2]`.
+    pub centre: Tensor,
+    /// Centre of what is drawn in a box less the box's own, `[B, N, 2]`. Boxes get no gradient from it.
+    pub offset: Tensor,
+}
+
 /// Draws objects `z [B, N, Z]` into images of `side` pixels.
 pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side: i64) -> Rendering {
     let Latents { pres, depth, place: z_where, what, .. } = layout.split(z);
@@ -41,21 +52,22 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
     }
 }
 
-/// Centres `[B, N, 2]` of what is drawn for objects `z [B, N, Z]`; only the boxes' centres have a gradient.
-pub(crate) fn drawn_centres(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Tensor {
-    let Latents { place, what, .. } = layout.split(z);
-    let within = {
-        let _no_grad = tch::no_grad_guard();
-        let alpha = decoder.forward(&what).select(2, 3); // [B, N, s, s]
-        let line = pixel_centres(alpha.size()[3], &alpha);
-        let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
-        let centre = |across: i64| {
-            let along = alpha.sum_dim_intlist(across, false, Kind::Float);
-            (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
-        };
-        Tensor::stack(&[centre(2), centre(3)], -1) * place.narrow(-1, 0, 2)
+/// Where objects `z [B, N, Z]` are.
+pub(crate) fn placed(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Placed {
+    let Latents { pres, place, what, .. } = layout.split(z);
+    let alpha = decoder.forward(&what).select(2, 3); // [B, N, s, s]
+    let line = pixel_centres(alpha.size()[3], &alpha);
+    let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
+    let middle = |across: i64| {
+        let along = alpha.sum_dim_intlist(across, false, Kind::Float);
+        (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
     };
-    place.narrow(-1, 2, 2) + within
+    let within = Tensor::stack(&[middle(2), middle(3)], -1);
+    Placed {
+        presence: pres,
+        centre: place.narrow(-1, 2, 2),
+        offset: within * place.narrow(-1, 0, 2).detach(),
+    }
 }
 
 impl Rendering {
@@ -93,7 +105,8 @@ mod tests {
             let along = alpha.sum_dim_intlist(across, false, Kind::Float);
             ((along * &line).sum(Kind::Float) / alpha.sum(Kind::Float)).double_value(&[])
         };
-        let found = drawn_centres(&decoder, &z, layout);
+        let Placed { centre: box_centre, offset, .. } = placed(&decoder, &z, layout);
+        let found = box_centre + offset;
         for (axis, across) in [(0, 0), (1, 1)] {
             let difference = found.double_value(&[0, 0, axis]) - centre(across);
             assert!(difference.abs() < 5e-3, "axis {axis}: {difference}");

@@ -104,10 +104,11 @@ fn decomposed_sheet(story: &Story) -> anyhow::Result<Sheet> {
         heading: "mixture slots: white where a slot explains the pixel".to_owned(),
         tiles: slots.collect(),
     };
-    let objects = scene.objects.iter().map(|(object, mask)| {
-        let pixel = |x: f32, side: u32| (x + 1.0) * (side as f32 / 2.0) - 0.5;
-        let (x, y) = (pixel(object.x, size.0), pixel(object.y, size.1));
-        let name = format!("object {} at {x:.0}, {y:.0}", object.id);
+    let named = scene.objects.iter().filter_map(|(painted, mask)| {
+        Some((belief.objects.iter().find(|object| object.id == painted.id)?, mask))
+    });
+    let objects = named.map(|(object, mask)| {
+        let name = format!("object {} at {:.0}, {:.0}", object.id, object.pixel_x, object.pixel_y);
         let more = format!("presence {:.2}", object.presence);
         tile(&cut_out(&scene.picture, mask), &[&name, &more])
     });
