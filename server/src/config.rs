@@ -125,6 +125,12 @@ pub struct Config {
     #[arg(long, env = "GATSBI_IMAGINE_BLOCK", default_value_t = 8, help_heading = "Engine")]
     pub imagine_block: usize,
 
+    /// Rows of the imagine blocks of rollouts that have at least so many rows: a row costs less among many, but a block
+    /// keeps observations waiting for longer. The same as the imagine block turns it off. Changing it changes answers in
+    /// their last bits.
+    #[arg(long, env = "GATSBI_WIDE_BLOCK", default_value_t = 32, help_heading = "Engine")]
+    pub wide_block: usize,
+
     /// How long rollouts may keep an observation waiting, in milliseconds; one block is always computed.
     #[arg(long, env = "GATSBI_TICK_MILLIS", default_value_t = 20, help_heading = "Engine")]
     pub tick_millis: u64,
@@ -347,7 +353,8 @@ impl Config {
             ("--threads", self.threads, 0..=1024),
             ("--observe-block", self.observe_block, 1..=1024),
             ("--imagine-block", self.imagine_block, 1..=1024),
-            ("--arena-rows", self.arena_rows, 2 * self.imagine_block..=1 << 20),
+            ("--wide-block", self.wide_block, self.imagine_block..=1024),
+            ("--arena-rows", self.arena_rows, 2 * self.wide_block..=1 << 20),
             ("--max-observes", self.max_observes, 1..=1 << 20),
             ("--max-rows", self.max_rows, self.max_request_rows as usize..=1 << 24),
             ("--max-request-rows", self.max_request_rows as usize, 1..=1 << 20),
@@ -423,6 +430,7 @@ impl Config {
             sizes: Sizes {
                 observe_block: self.observe_block,
                 imagine_block: self.imagine_block,
+                wide_block: self.wide_block,
                 slots: self.arena_rows,
             },
             tick: Duration::from_millis(self.tick_millis),

@@ -184,8 +184,14 @@ fn add_scene(
     let tracking = training_tracking(objects);
     let observed = batch.frames.len() - recipe.imagined.at(moment.step) as usize;
     let mut state = model.initial_state(rows);
+    // What is believed of the frames that are imagined when they are seen.
+    let mut seeing = None;
     for (t, frame) in batch.frames.iter().enumerate() {
         let first = state.first();
+        let foresight = objects.map_or(0.0, |objects| objects.foresight.at(moment.step));
+        if t == observed && foresight > 0.0 {
+            seeing = Some(state.shallow_clone());
+        }
         let dropout = objects.map_or(0.0, |objects| objects.discovery_dropout.at(moment.step));
         let discover =
             if t > 0 && dropped(moment, t, dropout) { Discover::None } else { Discover::All };
@@ -213,6 +219,22 @@ fn add_scene(
             if phase == Phase::Observed {
                 add_mixture_kl(terms, &recipe.mixture, &seen.mixture, &first, moment.step);
             }
+        }
+        seeing = seeing.map(|believed| {
+            let _no_grad = tch::no_grad_guard();
+            let how = Observing {
+                train: false,
+                priors: false,
+                objects: true,
+                discover: Discover::None,
+                tracking,
+                stops: GradientStops::default(),
+            };
+            model.observe(believed, frame, &batch.actions[t], &noise, how).0
+        });
+        if let Some(believed) = &seeing {
+            let distance = foresight_distance(model, &state, believed);
+            terms.add("foresight", distance, foresight);
         }
         let rendering = objects.map(|_| model.render(&state));
         let maps = Maps {
@@ -386,6 +408,20 @@ fn add_places(
         let distance = loss::following(&objects, &found, FOLLOWING_REACH / pixels);
         terms.add("following", distance * pixels.powi(2), following);
     }
+}
+
+/// Distance from which on foresight counts linearly, in pixels: less than half a push.
+const FORESIGHT_SCALE: f64 = 3.0;
+
+/// How far objects are imagined from where they are believed when the frames are seen, in squared pixels, `[B]`.
+fn foresight_distance(model: &Gatsbi, imagined: &GatsbiState, believed: &GatsbiState) -> Tensor {
+    let pixels = model.config().image_size as f64 / 2.0;
+    let placed = |state: &GatsbiState| model.objects().placed(&state.objects.z);
+    loss::foresight(
+        (&placed(imagined), &imagined.objects.ids),
+        (&placed(believed), &believed.objects.ids),
+        FORESIGHT_SCALE / pixels,
+    ) * pixels.powi(2)
 }
 
 fn add_objects_kl(

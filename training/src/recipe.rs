@@ -22,7 +22,7 @@ const NAMED: [(&str, &str); 11] = [
     ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
     ("tiny-finish", include_str!("../recipes/tiny-finish.toml")),
     ("tiny-long", include_str!("../recipes/tiny-long.toml")),
-    ("tiny-centre", include_str!("../recipes/tiny-centre.toml")),
+    ("tiny-foresight", include_str!("../recipes/tiny-foresight.toml")),
 ];
 
 /// How a model is trained.
@@ -214,6 +214,10 @@ pub struct ObjectRecipe {
     /// learn them from the likelihood.
     #[serde(default)]
     pub following: Ramp,
+    /// Weight, in nats a squared pixel, of the distance between an object that is imagined and where it is followed to when
+    /// the frames are seen. It reaches as far as objects are pushed; what is found near where one is imagined does not.
+    #[serde(default)]
+    pub foresight: Ramp,
     /// Weight, in nats a squared pixel, of the distance between what is drawn of an object and the centre of its box:
     /// nothing else holds a box to its object once following leads what is drawn.
     #[serde(default)]
@@ -342,6 +346,6 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("tiny-objects, tiny-finish, tiny-long, tiny-centre"), "{error}");
+        assert!(error.contains("tiny-objects, tiny-finish, tiny-long, tiny-foresight"), "{error}");
     }
 }

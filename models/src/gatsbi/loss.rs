@@ -86,15 +86,40 @@ pub fn keypoint_regression(gamma: &Tensor, agent_mask: &Tensor) -> Tensor {
 /// An object is drawn to the detections within some `reach` of it, the nearest most; one without any near it pays nothing.
 /// Distances are in units of the image's half side. Only the objects' centres get a gradient.
 pub fn following(objects: &Placed, found: &Placed, reach: f64) -> Tensor {
-    let drawn = |placed: &Placed| &placed.centre + placed.offset.detach();
-    let offset = drawn(objects).unsqueeze(2) - drawn(found).detach().unsqueeze(1); // [B, N, D, 2]
-    let distance = offset.square().sum_dim_intlist(-1, false, Kind::Float);
+    let distance = squared_distances(objects, found);
     let detected = found.presence.detach().transpose(1, 2); // [B, 1, D]
     let near = (distance.detach() * (-0.5 / (reach * reach))).exp() * detected;
     // As much as a detection at twice the reach: beyond it the weights fade.
     let nowhere = (-2.0_f64).exp();
     let weight = &near / (near.sum_dim_intlist(-1, true, Kind::Float) + nowhere);
     sum(&(weight * distance * objects.presence.detach()))
+}
+
+/// Distances between where objects are imagined and where they are when they are seen, `[B]`, summed over pairs of the same
+/// identity as far as both are present; multi-step predictions are judged by what is inferred from the frames, as in latent
+/// overshooting (Hafner et al. 2019).
+///
+/// Up to about `scale` a distance counts squared, beyond it linearly (pseudo-Huber): one that is lost must not outweigh all
+/// others. Distances and `scale` are in units of the image's half side. Identities are `[B, N]` and `[B, M]` int64, negative
+/// in slots that were never filled. Only the imagined objects' centres get a gradient.
+pub fn foresight(
+    (imagined, imagined_ids): (&Placed, &Tensor),
+    (seen, seen_ids): (&Placed, &Tensor),
+    scale: f64,
+) -> Tensor {
+    let distance = squared_distances(imagined, seen);
+    let distance = ((distance / scale.powi(2) + 1.0).sqrt() - 1.0) * scale.powi(2) * 2.0;
+    let ids = imagined_ids.unsqueeze(2);
+    let same = ids.eq_tensor(&seen_ids.unsqueeze(1)).logical_and(&ids.ge(0));
+    let both = imagined.presence.detach() * seen.presence.detach().transpose(1, 2); // [B, N, M]
+    sum(&(distance * both * same.to_kind(Kind::Float)))
+}
+
+/// Squared distances between where `objects` and `others` are drawn, `[B, N, M]`; only the objects' centres get a gradient.
+fn squared_distances(objects: &Placed, others: &Placed) -> Tensor {
+    let drawn = |placed: &Placed| &placed.centre + placed.offset.detach();
+    let offset = drawn(objects).unsqueeze(2) - drawn(others).detach().unsqueeze(1); // [B, N, M, 2]
+    offset.square().sum_dim_intlist(-1, false, Kind::Float)
 }
 
 /// Squared distances between where objects are drawn and the centres of their boxes, `[B]`, in units of the image's half
@@ -140,6 +165,23 @@ mod tests {
         let of = |object: i64| gradient.double_value(&[0, object, 0]);
         assert!((of(0) + 4.0 * weight).abs() < 1e-3, "{gradient}");
         assert!(of(1).abs() < 1e-3 && of(2).abs() < 1e-6, "{gradient}");
+    }
+
+    #[test]
+    fn an_imagined_object_is_led_to_where_the_same_one_is_seen() {
+        let mut imagined = placed(&[[1.0, 10.0, 20.0, 0.0, 0.0], [0.5, 30.0, 20.0, 0.0, 0.0]]);
+        imagined.centre = imagined.centre.set_requires_grad(true);
+        let seen = placed(&[[1.0, 30.0, 20.0, 0.0, 0.0], [1.0, 13.0, 24.0, 0.0, 0.0]]);
+        let ids = |ids: [i64; 2]| Tensor::from_slice(&ids).unsqueeze(0);
+        // The first is five units off, the second is nobody's.
+        let loss = foresight((&imagined, &ids([4, -1])), (&seen, &ids([-1, 4])), 2.0);
+        let expected = ((25.0_f64 / 4.0 + 1.0).sqrt() - 1.0) * 8.0;
+        assert!((loss.double_value(&[0]) - expected).abs() < 1e-4, "{loss}");
+        loss.sum(Kind::Float).backward();
+        let gradient = imagined.centre.grad();
+        let of = |object: i64, axis: i64| gradient.double_value(&[0, object, axis]);
+        assert!(of(0, 0) < -1.0 && of(0, 1) < -1.0, "{gradient}");
+        assert!(of(1, 0).abs() < 1e-6 && of(1, 1).abs() < 1e-6, "{gradient}");
     }
 
     #[test]

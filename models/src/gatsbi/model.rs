@@ -29,6 +29,16 @@ pub struct GatsbiState {
 }
 
 impl GatsbiState {
+    /// Another handle on the same tensors.
+    #[must_use]
+    pub fn shallow_clone(&self) -> Self {
+        Self {
+            mixture: self.mixture.shallow_clone(),
+            objects: self.objects.shallow_clone(),
+            step: self.step.shallow_clone(),
+        }
+    }
+
     /// Rows that have absorbed nothing, `[B]` bool.
     pub fn first(&self) -> Tensor {
         self.step.eq(0)

@@ -235,10 +235,12 @@ impl Door {
 
     /// How long a rollout takes alone, and its part of the time that workers have together.
     fn rollout_cost(&self, costs: &Costs, load: Load) -> [Duration; 2] {
-        let (rows, lanes) = (load.rows as usize, self.sizes.imagine_block);
-        let full = costs.imagine.full().saturating_mul((rows / lanes) as u32);
+        let rows = load.rows as usize;
+        let lanes = self.sizes.block_for(rows);
+        let cost = costs.of_imagine(lanes);
+        let full = cost.full().saturating_mul((rows / lanes) as u32);
         let rest = rows % lanes;
-        let rest = if rest > 0 { costs.imagine.of(rest) } else { Duration::ZERO };
+        let rest = if rest > 0 { cost.of(rest) } else { Duration::ZERO };
         let work = full.saturating_add(rest).saturating_mul(load.steps);
         let at_once = self.workers.min(rows.div_ceil(lanes).max(1) as u32);
         [at_once, self.workers].map(|workers| work / workers)
@@ -317,10 +319,11 @@ mod tests {
 
     fn door(observes: usize) -> (Arc<Door>, Costs) {
         let door = DoorSizes { observes, rows: 10, output_bytes: 8 << 10 };
-        let sizes = Sizes { observe_block: 1, imagine_block: 4, slots: 8 };
+        let sizes = Sizes { observe_block: 1, imagine_block: 4, wide_block: 9, slots: 8 };
         let costs = Costs {
             observe: Cost::new(millis(5), millis(5), 1),
             imagine: Cost::new(millis(8), millis(8), 4),
+            wide: Cost::new(millis(12), millis(12), 9),
         };
         (Arc::new(Door::new(door, sizes, 1)), costs)
     }
@@ -364,6 +367,9 @@ mod tests {
             }
             error => panic!("{error}"),
         }
+        let error = within(100, 9, 10).unwrap_err();
+        let one_wide = |needs| needs == millis(120);
+        assert!(matches!(error, Error::TooSlow { needs, .. } if one_wide(needs)), "{error}");
         let (first, _outputs) = within(200, 8, 10).unwrap();
         // Alone it would be in time; behind the first one, of another tenant, it would not.
         door.shared_by(1);
@@ -403,6 +409,7 @@ mod tests {
         let costs = Costs {
             observe: Cost::new(millis(5), millis(5), 1),
             imagine: Cost::new(millis(8), millis(8), 4),
+            wide: Cost::new(millis(12), millis(12), 9),
         };
         drop(door.admit_rollout(&costs, load(10, 1, 1)).unwrap());
         drop(bulk);

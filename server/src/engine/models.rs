@@ -90,6 +90,14 @@ impl std::fmt::Debug for Newcomer {
 pub(super) struct Costs {
     pub(super) observe: Cost,
     pub(super) imagine: Cost,
+    pub(super) wide: Cost,
+}
+
+impl Costs {
+    /// Of imagine blocks of so many lanes.
+    pub(super) fn of_imagine(&self, lanes: usize) -> &Cost {
+        if lanes == self.imagine.lanes { &self.imagine } else { &self.wide }
+    }
 }
 
 /// A block's cost, which grows evenly from that of a single row to that of a full block. Its scale follows what is
@@ -170,7 +178,7 @@ pub(super) fn warm_up(world: &dyn WorldModel, sizes: Sizes) -> Result<Costs, Str
         let device = world.device();
         let neutral = Tensor::from_slice(&world.spec().neutral_action()).to_device(device);
         let actions = |rows: i64| neutral.unsqueeze(0).expand([rows, -1], false).contiguous();
-        let (observed, imagined) = (sizes.observe_block as i64, sizes.imagine_block as i64);
+        let observed = sizes.observe_block as i64;
         let size = world.spec().image_size;
         let frames = Tensor::full([observed, 3, size, size], 0.5, (Kind::Float, device));
         let observe = |frame: Option<&Tensor>| {
@@ -180,23 +188,28 @@ pub(super) fn warm_up(world: &dyn WorldModel, sizes: Sizes) -> Result<Costs, Str
                 world.observe(&state, frame, &actions(observed), &noise, Outputs::default());
             state.to_rows();
         };
-        let imagine = || {
-            let noise = PhiloxNoise::mean(imagined, device);
-            let state = world.initial_state(imagined);
-            let (state, _) = world.imagine(&state, &actions(imagined), &noise, Outputs::default());
+        let imagine = |lanes: usize| {
+            let noise = PhiloxNoise::mean(lanes as i64, device);
+            let state = world.initial_state(lanes as i64);
+            let actions = actions(lanes as i64);
+            let (state, _) = world.imagine(&state, &actions, &noise, Outputs::default());
             state.to_rows();
         };
-        let cost = |lanes: i64, step: &dyn Fn()| {
+        let cost = |lanes: usize, step: &dyn Fn()| {
             let asked: Vec<bool> = (0..lanes).map(|lane| lane == 0).collect();
             let one = timed(|| asking_for(&asked, step));
-            Cost::new(one, timed(step), lanes as usize)
+            Cost::new(one, timed(step), lanes)
+        };
+        let imagined = |lanes: usize| {
+            imagine(lanes);
+            cost(lanes, &|| imagine(lanes))
         };
         observe(Some(&frames));
         observe(None);
-        imagine();
         Costs {
-            observe: cost(observed, &|| observe(Some(&frames))),
-            imagine: cost(imagined, &imagine),
+            observe: cost(sizes.observe_block, &|| observe(Some(&frames))),
+            imagine: imagined(sizes.imagine_block),
+            wide: imagined(sizes.wide_block),
         }
     };
     let panicked = || format!("{} panicked in its first steps", world.spec().name);
@@ -237,7 +250,7 @@ pub(crate) fn made_up(hash: &str, floats: usize, ints: usize) -> Arc<ModelEntry>
         row_bytes: 4 * floats + 8 * ints,
         device: "cpu".to_owned(),
         initial: Arc::new(initial),
-        costs: Costs { observe: cost(), imagine: cost() },
+        costs: Costs { observe: cost(), imagine: cost(), wide: cost() },
         engine: mpsc::channel(1).0.downgrade(),
     })
 }

@@ -36,9 +36,19 @@ pub struct Sizes {
     pub observe_block: usize,
     /// Rows of an imagine block.
     pub imagine_block: usize,
+    /// Rows of the imagine blocks of rollouts that have at least so many: a row costs less in them, but they keep others
+    /// waiting for longer. No less than `imagine_block`.
+    pub wide_block: usize,
     /// Rows that can be on their way through rollouts at once. No tenant holds more than half of them, so that there
     /// is room for whoever comes.
     pub slots: usize,
+}
+
+impl Sizes {
+    /// Rows of the blocks in which a rollout of so many rows is computed. It follows from the request alone, as lanes do.
+    pub fn block_for(self, rows: usize) -> usize {
+        if rows < self.wide_block { self.imagine_block } else { self.wide_block }
+    }
 }
 
 /// One time step of one row of a rollout.
@@ -63,7 +73,7 @@ pub struct Tick {
     pub seeing: Vec<Block<JobId>>,
     /// Observes without one, to be computed next.
     pub blind: Vec<Block<JobId>>,
-    /// Steps of rollouts, to be computed last.
+    /// Steps of rollouts, to be computed last, in blocks of either size.
     pub imagine: Vec<Block<RowStep>>,
 }
 
@@ -122,9 +132,9 @@ impl Scheduler {
         horizon: u32,
         deadline: Option<Instant>,
     ) {
-        let block = self.sizes.imagine_block as u64;
-        let lanes = lanes.map(|lane| (lane % block) as u32).collect();
-        self.shares.add(tenant, Rollout::new(job, lanes, horizon, deadline));
+        let lanes: Vec<u64> = lanes.collect();
+        let block = self.sizes.block_for(lanes.len());
+        self.shares.add(tenant, Rollout::new(job, (lanes, block), horizon, deadline));
     }
 
     /// Forgets a request, wherever it is.
@@ -156,9 +166,10 @@ impl Scheduler {
     }
 
     /// Forms what is computed at `now`: all live observes, and about `blocks` blocks of bulk observes and rollout
-    /// rows, half of them each where there is enough of both. What it names counts as computed; whoever cannot
-    /// compute it cancels the request.
-    pub fn tick(&mut self, now: Instant, blocks: usize) -> Tick {
+    /// rows, half of them each where there is enough of both. A wide block counts as the others that would hold its rows,
+    /// but there is always one for each of `workers`. What it names counts as computed; whoever cannot compute it cancels
+    /// the request.
+    pub fn tick(&mut self, now: Instant, blocks: usize, workers: usize) -> Tick {
         let expired = self.expire(now);
         let size = self.sizes.observe_block;
         let (mut seeing, mut blind) =
@@ -177,8 +188,10 @@ impl Scheduler {
             !blocks.place(observe.lane, observe.job)
         });
         let left = blocks.saturating_sub(seeing.count() + blind.count() - live).max(1);
-        let imagine = Blocks::new(self.sizes.imagine_block, left);
-        let imagine = self.shares.step(imagine, &mut self.free, self.sizes.slots);
+        let Sizes { imagine_block, wide_block, slots, .. } = self.sizes;
+        let wide = (left * imagine_block / wide_block).max(workers.min(left));
+        let sizes = [(imagine_block, left), (wide_block, wide)];
+        let imagine = self.shares.step(sizes, &mut self.free, slots);
         Tick { expired, seeing: seeing.into_open(), blind: blind.into_open(), imagine }
     }
 

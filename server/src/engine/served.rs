@@ -95,7 +95,7 @@ impl Served {
         let block = self.entry.upgrade().map(|entry| entry.costs.imagine.full().as_nanos());
         let rounds = (time.as_nanos() / block.unwrap_or(u128::MAX)).clamp(1, 64) as usize;
         let blocks = rounds * workers;
-        let mut tick = self.scheduler.tick(Instant::now(), blocks);
+        let mut tick = self.scheduler.tick(Instant::now(), blocks, workers);
         for job in std::mem::take(&mut tick.expired) {
             self.fail(job, Failure::Late);
         }
@@ -223,7 +223,7 @@ impl Served {
         let Some(entry) = self.entry.upgrade() else { return };
         let cost = match kind {
             Kind::Observe => &entry.costs.observe,
-            Kind::Imagine => &entry.costs.imagine,
+            Kind::Imagine => entry.costs.of_imagine(block.len()),
         };
         self.door.measured(cost, rows, elapsed);
     }

@@ -94,8 +94,12 @@ async fn disturb(
     }
 }
 
-async fn neighbours_do_not_matter(name: &str, observe_block: usize, imagine_block: usize) {
-    let config = Config { observe_block, imagine_block, ..named(name) };
+async fn neighbours_do_not_matter(
+    name: &str,
+    observe_block: usize,
+    [imagine_block, wide_block]: [usize; 2],
+) {
+    let config = Config { observe_block, imagine_block, wide_block, ..named(name) };
     let server = Arc::new(TestServer::with(config).await);
     let alone = told(&server, 6).await;
     let (apart, stop) = (Arc::new(Apart::default()), Arc::new(AtomicBool::new(false)));
@@ -118,18 +122,19 @@ async fn neighbours_do_not_matter(name: &str, observe_block: usize, imagine_bloc
     };
     // Four times three observes and 10 rows over 3 steps were the test's own.
     let observes = apart.observes.load(Ordering::Relaxed) + 4 * 3;
+    let block = if 10 < wide_block { imagine_block } else { wide_block };
     let imagines =
-        apart.imagines.load(Ordering::Relaxed) + (4 * 3 * 10usize.div_ceil(imagine_block)) as u64;
+        apart.imagines.load(Ordering::Relaxed) + (4 * 3 * 10usize.div_ceil(block)) as u64;
     assert!(blocks("imagine").await < imagines, "no two rollouts shared a block");
     assert!(observe_block == 1 || blocks("observe").await < observes, "no two observes did");
 }
 
 #[tokio::test]
 async fn neighbours_do_not_matter_in_small_blocks() {
-    neighbours_do_not_matter("small", 1, 8).await;
+    neighbours_do_not_matter("small", 1, [8, 32]).await;
 }
 
 #[tokio::test]
 async fn neighbours_do_not_matter_in_shared_and_odd_blocks() {
-    neighbours_do_not_matter("odd", 4, 5).await;
+    neighbours_do_not_matter("odd", 4, [5, 7]).await;
 }

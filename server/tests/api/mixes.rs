@@ -252,8 +252,12 @@ fn setting(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().unwrap())
 }
 
-async fn mixes_do_not_matter(name: &str, observe_block: usize, imagine_block: usize) {
-    let config = Config { observe_block, imagine_block, ..named(name) };
+async fn mixes_do_not_matter(
+    name: &str,
+    observe_block: usize,
+    [imagine_block, wide_block]: [usize; 2],
+) {
+    let config = Config { observe_block, imagine_block, wide_block, ..named(name) };
     let server = Arc::new(TestServer::with(config).await);
     let mut alone = Vec::new();
     for script in 0..SCRIPTS {
@@ -301,10 +305,10 @@ async fn mixes_do_not_matter(name: &str, observe_block: usize, imagine_block: us
 
 #[tokio::test]
 async fn mixes_do_not_matter_in_the_usual_blocks() {
-    mixes_do_not_matter("usual-mixes", 1, 8).await;
+    mixes_do_not_matter("usual-mixes", 1, [8, 32]).await;
 }
 
 #[tokio::test]
 async fn mixes_do_not_matter_in_shared_and_odd_blocks() {
-    mixes_do_not_matter("odd-mixes", 3, 5).await;
+    mixes_do_not_matter("odd-mixes", 3, [5, 7]).await;
 }

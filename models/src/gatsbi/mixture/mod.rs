@@ -60,6 +60,21 @@ pub struct MixtureState {
     pub comp_prior: Memory,
 }
 
+impl MixtureState {
+    /// Another handle on the same tensors.
+    #[must_use]
+    pub fn shallow_clone(&self) -> Self {
+        Self {
+            z_mask: self.z_mask.shallow_clone(),
+            z_comp: self.z_comp.shallow_clone(),
+            mask_post: self.mask_post.shallow_clone(),
+            mask_prior: self.mask_prior.shallow_clone(),
+            comp_post: self.comp_post.shallow_clone(),
+            comp_prior: self.comp_prior.shallow_clone(),
+        }
+    }
+}
+
 /// What one step of the mixture gives.
 #[derive(Debug)]
 pub struct MixtureStep {

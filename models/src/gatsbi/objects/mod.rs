@@ -53,6 +53,20 @@ pub struct ObjectState {
     pub next_id: Tensor,
 }
 
+impl ObjectState {
+    /// Another handle on the same tensors.
+    #[must_use]
+    pub fn shallow_clone(&self) -> Self {
+        Self {
+            z: self.z.shallow_clone(),
+            post: self.post.shallow_clone(),
+            prior: self.prior.shallow_clone(),
+            ids: self.ids.shallow_clone(),
+            next_id: self.next_id.shallow_clone(),
+        }
+    }
+}
+
 /// Frame and mixture of a step, as the objects see them.
 #[derive(Debug)]
 pub struct Scenery<'a> {

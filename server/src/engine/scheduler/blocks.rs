@@ -23,6 +23,11 @@ impl<T: Copy> Blocks<T> {
         Self { open: Vec::new(), taken: vec![0; size], most, full: 0 }
     }
 
+    /// Rows of each block.
+    pub(super) fn size(&self) -> usize {
+        self.taken.len()
+    }
+
     /// Blocks that are open.
     pub(super) fn count(&self) -> usize {
         self.open.len()

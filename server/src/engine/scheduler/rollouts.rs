@@ -26,8 +26,10 @@ pub(super) struct Rollout {
     pub(super) job: JobId,
     pub(super) deadline: Option<Instant>,
     horizon: u32,
-    /// Lane of each row.
-    lanes: Vec<u32>,
+    /// Rows of the blocks in which it is computed.
+    block: usize,
+    /// What the lane of each row follows from.
+    lanes: Vec<u64>,
     /// Rows that have not started, in order.
     waiting: VecDeque<u32>,
     active: Vec<Active>,
@@ -72,14 +74,16 @@ impl Shares {
     /// tenant, and with another of its rollouts, so that neither rounding nor a lane that two want favours any. Of `slots` a tenant holds so few that one more tenant finds its share.
     pub(super) fn step(
         &mut self,
-        mut blocks: Blocks<RowStep>,
+        sizes: [(usize, usize); 2],
         free: &mut Vec<u32>,
         slots: usize,
     ) -> Vec<Block<RowStep>> {
         if self.shares.is_empty() {
             return Vec::new();
         }
-        let share = (blocks.capacity() / self.shares.len()).max(1);
+        let mut blocks = self.blocks(sizes);
+        let capacity: usize = blocks.iter().map(Blocks::capacity).sum();
+        let share = (capacity / self.shares.len()).max(1);
         let most_slots = (slots / (self.shares.len() + 1)).max(1);
         for most in [share, usize::MAX] {
             for tenant in &mut self.shares {
@@ -96,7 +100,19 @@ impl Shares {
         if !self.shares.is_empty() {
             self.shares.rotate_left(1);
         }
-        blocks.into_open()
+        blocks.into_iter().flat_map(Blocks::into_open).collect()
+    }
+
+    /// Blocks of each size in which there are rollouts, which share the time evenly.
+    fn blocks(&self, sizes: [(usize, usize); 2]) -> Vec<Blocks<RowStep>> {
+        let used = |size: usize| self.rollouts().any(|rollout| rollout.block == size);
+        let [narrow, wide] = sizes;
+        let sizes: Vec<_> = match narrow.0 == wide.0 {
+            true => vec![narrow],
+            false => [wide, narrow].into_iter().filter(|(size, _)| used(*size)).collect(),
+        };
+        let each = |most: usize| most.div_ceil(sizes.len().max(1));
+        sizes.iter().map(|(size, most)| Blocks::new(*size, each(*most))).collect()
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&Rollout) -> bool) {
@@ -113,7 +129,7 @@ impl Share {
         &mut self,
         most: usize,
         most_slots: usize,
-        blocks: &mut Blocks<RowStep>,
+        blocks: &mut [Blocks<RowStep>],
         free: &mut Vec<u32>,
     ) {
         let (mut left, each) = (most, (most / self.rollouts.len()).max(1));
@@ -122,6 +138,8 @@ impl Share {
             for rollout in &mut self.rollouts {
                 let before = rollout.active.len();
                 let starts = most_slots.saturating_sub(held);
+                let blocks = blocks.iter_mut().find(|blocks| blocks.size() == rollout.block);
+                let blocks = blocks.expect("there are blocks of every size that is used");
                 left -= rollout.step(rows.min(left), starts, blocks, free);
                 held += rollout.active.len() - before;
             }
@@ -132,12 +150,12 @@ impl Share {
 impl Rollout {
     pub(super) fn new(
         job: JobId,
-        lanes: Vec<u32>,
+        (lanes, block): (Vec<u64>, usize),
         horizon: u32,
         deadline: Option<Instant>,
     ) -> Self {
         let waiting = (0..lanes.len() as u32).collect();
-        Self { job, deadline, horizon, lanes, waiting, active: Vec::new() }
+        Self { job, deadline, horizon, block, lanes, waiting, active: Vec::new() }
     }
 
     /// Puts up to `most` rows that do not step yet into blocks: those on their way first, so that few rows hold
@@ -156,7 +174,7 @@ impl Rollout {
             }
             let Active { row, depth, slot, .. } = *active;
             let step = RowStep { job: self.job, row, depth: depth + 1, slot };
-            active.stepping = blocks.place(self.lanes[row as usize].into(), step);
+            active.stepping = blocks.place(self.lanes[row as usize], step);
             placed += usize::from(active.stepping);
         }
         let most = most.min(placed.saturating_add(starts));
@@ -165,7 +183,7 @@ impl Rollout {
             let Some(&slot) = free.last() else { break };
             let Some(row) = self.waiting.pop_front() else { break };
             let step = RowStep { job: self.job, row, depth: 1, slot };
-            if blocks.place(self.lanes[row as usize].into(), step) {
+            if blocks.place(self.lanes[row as usize], step) {
                 free.pop();
                 self.active.push(Active { row, depth: 0, slot, stepping: true });
                 placed += 1;
