@@ -380,8 +380,11 @@ fn add_composite(
     terms.add("alpha", alpha, 0.0);
 }
 
-/// How near discovery must find an object to draw it, in pixels: less than the distance of neighbours.
-const FOLLOWING_REACH: f64 = 3.0;
+/// How near discovery must find an object to draw it, in pixels: as far as one is pushed in a frame.
+const FOLLOWING_REACH: f64 = 6.0;
+
+/// Distance from which on places that are missed count linearly, in pixels: less than half a push.
+const LENIENT: f64 = 3.0;
 
 /// Leads followed and imagined objects to what discovery finds, and what is drawn of objects to the centres of their boxes.
 fn add_places(
@@ -405,13 +408,11 @@ fn add_places(
             let _no_grad = tch::no_grad_guard();
             model.objects().placed(&model.objects().detect(frame, &mixture.mu_mix))
         };
-        let distance = loss::following(&objects, &found, FOLLOWING_REACH / pixels);
+        let distance =
+            loss::following(&objects, &found, FOLLOWING_REACH / pixels, LENIENT / pixels);
         terms.add("following", distance * pixels.powi(2), following);
     }
 }
-
-/// Distance from which on foresight counts linearly, in pixels: less than half a push.
-const FORESIGHT_SCALE: f64 = 3.0;
 
 /// How far objects are imagined from where they are believed when the frames are seen, in squared pixels, `[B]`.
 fn foresight_distance(model: &Gatsbi, imagined: &GatsbiState, believed: &GatsbiState) -> Tensor {
@@ -420,7 +421,7 @@ fn foresight_distance(model: &Gatsbi, imagined: &GatsbiState, believed: &GatsbiS
     loss::foresight(
         (&placed(imagined), &imagined.objects.ids),
         (&placed(believed), &believed.objects.ids),
-        FORESIGHT_SCALE / pixels,
+        LENIENT / pixels,
     ) * pixels.powi(2)
 }
 

@@ -35,7 +35,7 @@ use crate::{setup, twin};
 
 const PRESETS: [&str; 2] = ["tiny", "push1"];
 const BATCHES: [usize; 4] = [1, 8, 64, 256];
-const STEPS: [&str; 2] = ["observe", "imagine"];
+const STEPS: [&str; 3] = ["observe", "imagine", "train"];
 
 /// The twin's memory formats, in the order of its sides.
 const FORMATS: [&str; 2] = ["channels-last", "contiguous"];
@@ -289,8 +289,12 @@ fn lines(batches: &[usize]) -> Vec<Line> {
     let mut lines = Vec::new();
     for preset in PRESETS {
         for &batch in batches {
-            // Nobody observes hundreds of sessions at once.
-            let steps = STEPS.into_iter().filter(|step| batch <= 64 || *step == "imagine");
+            // Nobody observes hundreds of sessions at once, and recipes train on eight sequences.
+            let steps = STEPS.into_iter().filter(|step| match *step {
+                "observe" => batch <= 64,
+                "train" => batch == 8,
+                _ => true,
+            });
             lines.extend(steps.map(|step| Line { preset, batch, step, rounds: Vec::new() }));
         }
     }

@@ -80,39 +80,56 @@ pub fn keypoint_regression(gamma: &Tensor, agent_mask: &Tensor) -> Tensor {
     sum(&(gamma - agent_mask).square())
 }
 
-/// Squared distances between where objects are drawn and where discovery draws them, `[B]`, summed over objects as far as
-/// they are present.
+/// How far two of a colour may be apart in it, in [0, 1]: the standard deviation of the image likelihood.
+const SAME_COLOUR: f64 = 0.1;
+
+/// Distances between where objects are drawn and where discovery draws them, `[B]`, summed over objects as far as they are
+/// present.
 ///
-/// An object is drawn to the detections within some `reach` of it, the nearest most; one without any near it pays nothing.
-/// Distances are in units of the image's half side. Only the objects' centres get a gradient.
-pub fn following(objects: &Placed, found: &Placed, reach: f64) -> Tensor {
+/// An object is drawn to the detections of its colour within some `reach` of it that no other object is at, the nearest
+/// most; one without any near it pays nothing. Distances count as in [`lenient`] and are in units of the image's half side,
+/// as `reach` and `scale` are. Only the objects' centres get a gradient.
+pub fn following(objects: &Placed, found: &Placed, reach: f64, scale: f64) -> Tensor {
     let distance = squared_distances(objects, found);
+    let far = distance.detach();
+    let other = objects.colour.unsqueeze(2) - found.colour.unsqueeze(1); // [B, N, D, 3]
+    let other = other.detach().square().sum_dim_intlist(-1, false, Kind::Float);
+    let unlike = &far / reach.powi(2) + other / SAME_COLOUR.powi(2);
+    let presence = objects.presence.detach();
+    let at = (far * (-0.5 / scale.powi(2))).exp() * &presence; // [B, N, D]
+    let itself = Tensor::eye(at.size()[1], (Kind::Bool, at.device())).unsqueeze(-1);
+    let by_others = at.unsqueeze(1).masked_fill(&itself, 0.0).amax(2, false);
     let detected = found.presence.detach().transpose(1, 2); // [B, 1, D]
-    let near = (distance.detach() * (-0.5 / (reach * reach))).exp() * detected;
+    let near: Tensor = (unlike * -0.5).exp() * detected * (1.0 - by_others);
     // As much as a detection at twice the reach: beyond it the weights fade.
     let nowhere = (-2.0_f64).exp();
     let weight = &near / (near.sum_dim_intlist(-1, true, Kind::Float) + nowhere);
-    sum(&(weight * distance * objects.presence.detach()))
+    sum(&(weight * lenient(&distance, scale) * presence))
 }
 
 /// Distances between where objects are imagined and where they are when they are seen, `[B]`, summed over pairs of the same
 /// identity as far as both are present; multi-step predictions are judged by what is inferred from the frames, as in latent
 /// overshooting (Hafner et al. 2019).
 ///
-/// Up to about `scale` a distance counts squared, beyond it linearly (pseudo-Huber): one that is lost must not outweigh all
-/// others. Distances and `scale` are in units of the image's half side. Identities are `[B, N]` and `[B, M]` int64, negative
-/// in slots that were never filled. Only the imagined objects' centres get a gradient.
+/// Distances count as in [`lenient`] and are in units of the image's half side, as `scale` is. Identities are `[B, N]` and
+/// `[B, M]` int64, negative in slots that were never filled. Only the imagined objects' centres get a gradient.
 pub fn foresight(
     (imagined, imagined_ids): (&Placed, &Tensor),
     (seen, seen_ids): (&Placed, &Tensor),
     scale: f64,
 ) -> Tensor {
-    let distance = squared_distances(imagined, seen);
-    let distance = ((distance / scale.powi(2) + 1.0).sqrt() - 1.0) * scale.powi(2) * 2.0;
+    let distance = lenient(&squared_distances(imagined, seen), scale);
     let ids = imagined_ids.unsqueeze(2);
     let same = ids.eq_tensor(&seen_ids.unsqueeze(1)).logical_and(&ids.ge(0));
     let both = imagined.presence.detach() * seen.presence.detach().transpose(1, 2); // [B, N, M]
     sum(&(distance * both * same.to_kind(Kind::Float)))
+}
+
+/// Distances that count squared up to about `scale` and linearly beyond it (pseudo-Huber), of squared ones: an object that is
+/// lost must not outweigh all others.
+fn lenient(squared: &Tensor, scale: f64) -> Tensor {
+    let unit = 2.0 * scale.powi(2);
+    ((squared / scale.powi(2) + 1.0).sqrt() - 1.0) * unit
 }
 
 /// Squared distances between where `objects` and `others` are drawn, `[B, N, M]`; only the objects' centres get a gradient.
@@ -139,11 +156,17 @@ mod tests {
 
     use super::*;
 
-    /// Objects given as presence, centre x, y, offset x, y.
+    /// Grey objects given as presence, centre x, y, offset x, y.
     fn placed(objects: &[[f32; 5]]) -> Placed {
         let all = Tensor::from_slice(&objects.concat()).view([1, -1, 5]);
         let part = |from, width| all.narrow(-1, from, width).copy();
-        Placed { presence: part(0, 1), centre: part(1, 2), offset: part(3, 2) }
+        let colour = Tensor::full([1, objects.len() as i64, 3], 0.5, (Kind::Float, Device::Cpu));
+        Placed { presence: part(0, 1), centre: part(1, 2), offset: part(3, 2), colour }
+    }
+
+    /// What a distance counts with a scale of 2.
+    fn lenient_2(distance: f64) -> f64 {
+        ((distance * distance / 4.0 + 1.0).sqrt() - 1.0) * 8.0
     }
 
     #[test]
@@ -156,15 +179,29 @@ mod tests {
         ]);
         objects.centre = objects.centre.set_requires_grad(true);
         let found = placed(&[[1.0, 36.0, 20.0, -2.0, 0.0], [0.0, 31.0, 20.0, 0.0, 0.0]]);
-        let loss = following(&objects, &found, 4.0);
+        let loss = following(&objects, &found, 4.0, 2.0);
         let near = (-0.5_f64 * 4.0 / 16.0).exp();
         let weight = near / (near + (-2.0_f64).exp());
-        assert!((loss.double_value(&[0]) - 4.0 * weight).abs() < 1e-3, "{loss}");
+        assert!((loss.double_value(&[0]) - lenient_2(2.0) * weight).abs() < 1e-3, "{loss}");
         loss.sum(Kind::Float).backward();
         let gradient = objects.centre.grad();
         let of = |object: i64| gradient.double_value(&[0, object, 0]);
-        assert!((of(0) + 4.0 * weight).abs() < 1e-3, "{gradient}");
+        assert!(of(0) < -1.0, "{gradient}");
         assert!(of(1).abs() < 1e-3 && of(2).abs() < 1e-6, "{gradient}");
+    }
+
+    #[test]
+    fn an_object_is_drawn_to_no_other_colour_and_not_to_where_another_is() {
+        let grey = |x: f32| [1.0, x, 20.0, 0.0, 0.0];
+        let mut found = placed(&[grey(34.0), grey(39.0)]);
+        found.colour = Tensor::from_slice(&[0.9f32, 0.1, 0.1, 0.5, 0.5, 0.5]).view([1, 2, 3]);
+        // The one of its colour is farther.
+        let near = (-0.5_f64 * 36.0 / 64.0).exp();
+        let expected = lenient_2(6.0) * near / (near + (-2.0_f64).exp());
+        let loss = following(&placed(&[grey(33.0)]), &found, 8.0, 2.0).double_value(&[0]);
+        assert!((loss - expected).abs() < 1e-3, "{loss} instead of {expected}");
+        let loss = following(&placed(&[grey(33.0), grey(39.0)]), &found, 8.0, 2.0);
+        assert!(loss.double_value(&[0]) < 1e-3, "{loss}");
     }
 
     #[test]
@@ -175,8 +212,7 @@ mod tests {
         let ids = |ids: [i64; 2]| Tensor::from_slice(&ids).unsqueeze(0);
         // The first is five units off, the second is nobody's.
         let loss = foresight((&imagined, &ids([4, -1])), (&seen, &ids([-1, 4])), 2.0);
-        let expected = ((25.0_f64 / 4.0 + 1.0).sqrt() - 1.0) * 8.0;
-        assert!((loss.double_value(&[0]) - expected).abs() < 1e-4, "{loss}");
+        assert!((loss.double_value(&[0]) - lenient_2(5.0)).abs() < 1e-4, "{loss}");
         loss.sum(Kind::Float).backward();
         let gradient = imagined.centre.grad();
         let of = |object: i64, axis: i64| gradient.double_value(&[0, object, axis]);

@@ -11,10 +11,7 @@ pub(super) fn figures(lines: &[Line]) -> BTreeMap<String, f64> {
         let mut put = |name: String, figure| figures.insert(format!("{preset}.{name}"), figure);
         for line in lines.iter().filter(|line| line.preset == preset) {
             let [_, ratio, _] = line.ratio();
-            match line.step {
-                "imagine" => put(format!("imagine_vs_twin_n{}", line.batch), ratio),
-                _ => put(format!("observe_vs_twin_n{}", line.batch), ratio),
-            };
+            put(format!("{}_vs_twin_n{}", line.step, line.batch), ratio);
             if line.rounds.iter().all(|round| round.compiled.is_some()) {
                 let compiled = |round: &Round| round.compiled.unwrap_or(f64::NAN) / round.rust;
                 put(format!("imagine_vs_compile_n{}", line.batch), line.median(compiled));

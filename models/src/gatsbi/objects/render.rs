@@ -22,7 +22,8 @@ pub struct Rendering {
     pub masks: Tensor,
 }
 
-/// Where objects are, in units of the image's half side from its centre. A box need not be centred on its object.
+/// Where objects are, in units of the image's half side from its centre, and of which colour. A box need not be centred on
+/// its object.
 #[derive(Debug)]
 pub struct Placed {
     /// Presence, `[B, N, 1]`.
@@ -31,6 +32,8 @@ pub struct Placed {
     pub centre: Tensor,
     /// Centre of what is drawn in a box less the box's own, `[B, N, 2]`. Boxes get no gradient from it.
     pub offset: Tensor,
+    /// Mean colour of what is drawn, `[B, N, 3]` in [0, 1].
+    pub colour: Tensor,
 }
 
 /// Draws objects `z [B, N, Z]` into images of `side` pixels.
@@ -55,15 +58,19 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
 /// Where objects `z [B, N, Z]` are.
 pub(crate) fn placed(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Placed {
     let Latents { pres, place, what, .. } = layout.split(z);
-    let alpha = decoder.forward(&what).select(2, 3); // [B, N, s, s]
+    let glimpses = decoder.forward(&what); // [B, N, 4, s, s]
+    let alpha = glimpses.select(2, 3); // [B, N, s, s]
     let line = pixel_centres(alpha.size()[3], &alpha);
     let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
+    let painted = glimpses.narrow(2, 0, 3) * alpha.unsqueeze(2);
+    let painted = painted.sum_dim_intlist([3i64, 4].as_slice(), false, Kind::Float);
     let middle = |across: i64| {
         let along = alpha.sum_dim_intlist(across, false, Kind::Float);
         (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
     };
     let within = Tensor::stack(&[middle(2), middle(3)], -1);
     Placed {
+        colour: painted / total.unsqueeze(-1),
         presence: pres,
         centre: place.narrow(-1, 2, 2),
         offset: within * place.narrow(-1, 0, 2).detach(),

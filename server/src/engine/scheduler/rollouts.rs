@@ -107,11 +107,9 @@ impl Shares {
     fn blocks(&self, sizes: [(usize, usize); 2]) -> Vec<Blocks<RowStep>> {
         let used = |size: usize| self.rollouts().any(|rollout| rollout.block == size);
         let [narrow, wide] = sizes;
-        let sizes: Vec<_> = match narrow.0 == wide.0 {
-            true => vec![narrow],
-            false => [wide, narrow].into_iter().filter(|(size, _)| used(*size)).collect(),
-        };
-        let each = |most: usize| most.div_ceil(sizes.len().max(1));
+        let sizes = if narrow.0 == wide.0 { vec![narrow] } else { vec![wide, narrow] };
+        let sizes: Vec<_> = sizes.into_iter().filter(|(size, _)| used(*size)).collect();
+        let each = |most: usize| most.div_ceil(sizes.len());
         sizes.iter().map(|(size, most)| Blocks::new(*size, each(*most))).collect()
     }
 
