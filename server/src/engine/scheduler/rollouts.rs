@@ -70,8 +70,11 @@ impl Shares {
         });
     }
 
-    /// Tenants share the blocks evenly, and what one leaves the others take. The next tick begins with another
-    /// tenant, and with another of its rollouts, so that neither rounding nor a lane that two want favours any. Of `slots` a tenant holds so few that one more tenant finds its share.
+    /// Steps of rollouts in blocks of both `sizes`, rows and how many blocks there may be.
+    ///
+    /// Tenants share the blocks evenly, and what one leaves the others take. The next tick begins with another tenant, and
+    /// with another of its rollouts, so that neither rounding nor a lane that two want favours any. Of `slots` a tenant
+    /// holds so few that one more tenant finds its share.
     pub(super) fn step(
         &mut self,
         sizes: [(usize, usize); 2],
