@@ -188,8 +188,7 @@ fn add_scene(
     let mut seeing = None;
     for (t, frame) in batch.frames.iter().enumerate() {
         let first = state.first();
-        let foresight = objects.map_or(0.0, |objects| objects.foresight.at(moment.step));
-        if t == observed && foresight > 0.0 {
+        if t == observed && objects.is_some_and(|objects| objects.foresight.at(moment.step) > 0.0) {
             seeing = Some(state.shallow_clone());
         }
         let dropout = objects.map_or(0.0, |objects| objects.discovery_dropout.at(moment.step));
@@ -232,10 +231,6 @@ fn add_scene(
             };
             model.observe(believed, frame, &batch.actions[t], &noise, how).0
         });
-        if let Some(believed) = &seeing {
-            let distance = foresight_distance(model, &state, believed);
-            terms.add("foresight", distance, foresight);
-        }
         let rendering = objects.map(|_| model.render(&state));
         let maps = Maps {
             gamma: gamma.map(|gamma| &gamma[t]),
@@ -247,8 +242,8 @@ fn add_scene(
         add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
         if let (Some(objects), Some(rendering)) = (objects, &rendering) {
             add_composite(terms, objects, rendering, &seen.mixture, frame, moment.step, phase);
-            let at = (moment.step, t > 0);
-            add_places(terms, model, objects, (&state, &seen.mixture), frame, at);
+            let known = (&state, &seen.mixture, seeing.as_ref());
+            add_places(terms, model, objects, known, frame, (moment.step, t));
             if let Some(found) = &seen.objects {
                 add_objects_kl(terms, model, objects, found, &first, moment.step);
             }
@@ -386,43 +381,43 @@ const FOLLOWING_REACH: f64 = 6.0;
 /// Distance from which on places that are missed count linearly, in pixels: less than half a push.
 const LENIENT: f64 = 3.0;
 
-/// Leads followed and imagined objects to what discovery finds, and what is drawn of objects to the centres of their boxes.
+/// Leads followed and imagined objects to what discovery finds, imagined ones to where they are `believed` to be when the
+/// frames are seen, and what is drawn of objects to the centres of their boxes.
 fn add_places(
     terms: &mut Terms,
     model: &Gatsbi,
     recipe: &ObjectRecipe,
-    (state, mixture): (&GatsbiState, &MixtureStep),
+    (state, mixture, believed): (&GatsbiState, &MixtureStep, Option<&GatsbiState>),
     frame: &Tensor,
-    (step, known): (u64, bool),
+    (step, t): (u64, usize),
 ) {
-    let (following, centring) = (recipe.following.at(step), recipe.centring.at(step));
-    let following = if known { following } else { 0.0 };
-    if following == 0.0 && centring == 0.0 {
+    // What was found in the first frame is where discovery finds it.
+    let following = if t > 0 { recipe.following.at(step) } else { 0.0 };
+    let centring = recipe.centring.at(step);
+    if following == 0.0 && centring == 0.0 && believed.is_none() {
         return;
     }
     let pixels = model.config().image_size as f64 / 2.0;
-    let objects = model.objects().placed(&state.objects.z);
-    terms.add("centring", loss::centring(&objects) * pixels.powi(2), centring);
+    let placed = |z: &Tensor| model.objects().placed(z);
+    let mut add = |name, distance: Tensor, weight| {
+        terms.add(name, distance * pixels.powi(2), weight);
+    };
+    let objects = placed(&state.objects.z);
+    add("centring", loss::centring(&objects), centring);
     if following > 0.0 {
         let found = {
             let _no_grad = tch::no_grad_guard();
-            model.objects().placed(&model.objects().detect(frame, &mixture.mu_mix))
+            placed(&model.objects().detect(frame, &mixture.mu_mix))
         };
-        let distance =
-            loss::following(&objects, &found, FOLLOWING_REACH / pixels, LENIENT / pixels);
-        terms.add("following", distance * pixels.powi(2), following);
+        let (reach, scale) = (FOLLOWING_REACH / pixels, LENIENT / pixels);
+        add("following", loss::following(&objects, &found, reach, scale), following);
     }
-}
-
-/// How far objects are imagined from where they are believed when the frames are seen, in squared pixels, `[B]`.
-fn foresight_distance(model: &Gatsbi, imagined: &GatsbiState, believed: &GatsbiState) -> Tensor {
-    let pixels = model.config().image_size as f64 / 2.0;
-    let placed = |state: &GatsbiState| model.objects().placed(&state.objects.z);
-    loss::foresight(
-        (&placed(imagined), &imagined.objects.ids),
-        (&placed(believed), &believed.objects.ids),
-        LENIENT / pixels,
-    ) * pixels.powi(2)
+    if let Some(believed) = believed {
+        let seen = placed(&believed.objects.z);
+        let (ids, seen_ids) = (&state.objects.ids, &believed.objects.ids);
+        let distance = loss::foresight((&objects, ids), (&seen, seen_ids), LENIENT / pixels);
+        add("foresight", distance, recipe.foresight.at(step));
+    }
 }
 
 fn add_objects_kl(

@@ -346,6 +346,8 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
-        assert!(error.contains("tiny-objects, tiny-finish, tiny-long, tiny-foresight"), "{error}");
+        let names =
+            "balls, tiny, tiny-refine, tiny-objects, tiny-finish, tiny-long, tiny-foresight";
+        assert!(error.contains(names), "{error}");
     }
 }

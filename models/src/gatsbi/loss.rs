@@ -169,6 +169,11 @@ mod tests {
         ((distance * distance / 4.0 + 1.0).sqrt() - 1.0) * 8.0
     }
 
+    /// The slope of that, over the distance.
+    fn slope_2(distance: f64) -> f64 {
+        2.0 / (distance * distance / 4.0 + 1.0).sqrt()
+    }
+
     #[test]
     fn an_object_is_drawn_to_what_is_found_near_it() {
         // One object drawn two units left of a detection, one far from all, one absent.
@@ -186,7 +191,7 @@ mod tests {
         loss.sum(Kind::Float).backward();
         let gradient = objects.centre.grad();
         let of = |object: i64| gradient.double_value(&[0, object, 0]);
-        assert!(of(0) < -1.0, "{gradient}");
+        assert!((of(0) + 2.0 * slope_2(2.0) * weight).abs() < 1e-3, "{gradient}");
         assert!(of(1).abs() < 1e-3 && of(2).abs() < 1e-6, "{gradient}");
     }
 
@@ -216,7 +221,9 @@ mod tests {
         loss.sum(Kind::Float).backward();
         let gradient = imagined.centre.grad();
         let of = |object: i64, axis: i64| gradient.double_value(&[0, object, axis]);
-        assert!(of(0, 0) < -1.0 && of(0, 1) < -1.0, "{gradient}");
+        for (axis, off) in [(0, 3.0), (1, 4.0)] {
+            assert!((of(0, axis) + off * slope_2(5.0)).abs() < 1e-4, "{gradient}");
+        }
         assert!(of(1, 0).abs() < 1e-6 && of(1, 1).abs() < 1e-6, "{gradient}");
     }
 

@@ -30,7 +30,7 @@ enum Command {
     /// idle session.
     Inside,
     /// Make steps when told to: each line `CHECKPOINT BATCH STEP SECONDS` on standard input is answered by how often the step
-    /// (observe, imagine or multiply) was made, its multiply-accumulates, and the bytes of a state
+    /// (observe, imagine, train or multiply) was made, its multiply-accumulates, and the bytes of a state
     Steps,
 }
 

@@ -1,7 +1,7 @@
 //! Steps of a frozen model on one thread, beside its twin's (`tests/reference/gatsbi_twin/timing.py`).
 //!
 //! Each line `CHECKPOINT BATCH STEP SECONDS` has a step (`observe`, `imagine` or `train`) repeated for so long, at least once, and
-//! is answered by how often it was made, the multiply-accumulates of one, and the bytes of a row's state; whoever asks
+//! is answered by how often it was made, the multiply-accumulates of one, and, but for `train`, the bytes of a row's state; whoever asks
 //! looks at the processor time meanwhile. Steps are those that a server makes: packed state, actions in raw units,
 //! counter-based noise, new objects looked for in every frame, nothing drawn. `train` is what an optimiser's step needs: the
 //! loss of a sequence of [`SEQUENCE`] frames, every network but the keypoints' in it, and its gradients. The step `multiply` is a product of square
@@ -76,7 +76,7 @@ impl Steps {
                 Entry::Vacant(new) => new.insert(Sequence::new(Path::new(checkpoint), rows)?),
             };
             let (made, macs) = repeat(time, || sequence.train());
-            return Ok(format!("{made} {macs} 0"));
+            return Ok(format!("{made} {macs}"));
         }
         let batch = match self.batches.entry((checkpoint.to_owned(), rows)) {
             Entry::Occupied(there) => there.into_mut(),
