@@ -1,5 +1,7 @@
 //! Training data in memory: random crops of episodes as batches of tensors.
 
+use std::ops::Range;
+
 use anyhow::Context as _;
 use gatsbi_episodes::Dataset;
 use gatsbi_models::{noise::philox4x32_10, world_model::ActionDimension};
@@ -8,7 +10,7 @@ use tch::{Device, Kind, Tensor};
 use crate::evaluation::Recorded;
 
 /// Levels (of 255) by which shadows darken a channel: their peak in the histogram is looked for here.
-const SHADOWS: std::ops::Range<usize> = 5..64;
+const SHADOWS: Range<usize> = 5..64;
 
 /// A level that a pixel has this often, as a share of its most frequent one, is one that it returns to.
 const LASTING: f64 = 0.25;
@@ -42,6 +44,14 @@ struct Episode {
     actions: Tensor,    // [T, A] raw
 }
 
+/// Where a sequence of a batch begins.
+struct Crop<'a> {
+    episode: &'a Episode,
+    start: i64,
+    /// Whether the first frame of an episode is one that no action led to.
+    neutral: bool,
+}
+
 /// A batch of sequences.
 #[derive(Debug)]
 pub struct Batch {
@@ -57,7 +67,7 @@ pub struct Batch {
 
 impl Clips {
     /// Reads the episodes `range` of a data set.
-    pub fn read(dataset: &Dataset, range: std::ops::Range<usize>) -> anyhow::Result<Self> {
+    pub fn read(dataset: &Dataset, range: Range<usize>) -> anyhow::Result<Self> {
         let info = dataset.info();
         let (height, width) = (i64::from(info.height), i64::from(info.width));
         let mut read = Vec::new();
@@ -140,33 +150,45 @@ impl Clips {
     /// The batch of step `step`: a function of its arguments alone.
     pub fn batch(&self, seed: u64, step: u64, batch: i64, length: i64, device: Device) -> Batch {
         let key = [seed as u32, (seed >> 32) as u32];
-        let mut rows = Vec::new();
-        for row in 0..batch {
+        let row = |row| {
             let counter = [row as u32, 0x636c_6970, step as u32, (step >> 32) as u32];
             let [episode, start, neutral, _] = philox4x32_10(counter, key);
             let episode = &self.episodes[episode as usize % self.episodes.len()];
             let starts = episode.frames.size()[0] - length + 1;
-            rows.push((episode, i64::from(start) % starts, neutral % 2 == 0));
-        }
-        let stack = |part: &dyn Fn(&Episode, i64) -> Tensor| {
-            let rows: Vec<Tensor> = rows.iter().map(|(e, start, _)| part(e, *start)).collect();
-            Tensor::stack(&rows, 1).to_device(device) // [T, B, ...]
+            Crop { episode, start: i64::from(start) % starts, neutral: neutral % 2 == 0 }
+        };
+        let crops: Vec<Crop<'_>> = (0..batch).map(row).collect();
+        self.stacked(&crops, length, device)
+    }
+
+    /// The first `length` frames of episodes, to which no action led.
+    pub fn beginnings(&self, episodes: Range<usize>, length: i64, device: Device) -> Batch {
+        let crop = |episode| Crop { episode, start: 0, neutral: true };
+        let crops: Vec<Crop<'_>> = self.episodes[episodes].iter().map(crop).collect();
+        self.stacked(&crops, length, device)
+    }
+
+    fn stacked(&self, crops: &[Crop<'_>], length: i64, device: Device) -> Batch {
+        let stack = |part: &dyn Fn(&Episode) -> &Tensor| {
+            let rows = crops.iter().map(|crop| part(crop.episode).narrow(0, crop.start, length));
+            Tensor::stack(&rows.collect::<Vec<_>>(), 1).to_device(device) // [T, B, ...]
         };
         let image = |x: Tensor| x.to_kind(Kind::Float) / 255.0;
-        let frames = image(stack(&|e, start| e.frames.narrow(0, start, length)));
+        let frames = image(stack(&|e| &e.frames));
         let map = |x: Tensor| image(x).unsqueeze(2).unbind(0);
-        let foreground = map(stack(&|e, start| e.foreground.narrow(0, start, length)));
-        let motion = map(stack(&|e, start| e.motion.narrow(0, start, length)));
-        let actions: Vec<Tensor> = rows
+        let foreground = map(stack(&|e| &e.foreground));
+        let motion = map(stack(&|e| &e.motion));
+        let actions: Vec<Tensor> = crops
             .iter()
-            .map(|(e, start, neutral)| {
+            .map(|Crop { episode, start, neutral }| {
+                let actions = &episode.actions;
                 // Nothing led to the first frame of an episode: none, or the paper's convention.
                 let first = match (*start, neutral) {
-                    (0, true) => e.actions.narrow(0, 0, 1).zeros_like(),
-                    (0, false) => e.actions.narrow(0, 0, 1),
-                    (start, _) => e.actions.narrow(0, start - 1, 1),
+                    (0, true) => actions.narrow(0, 0, 1).zeros_like(),
+                    (0, false) => actions.narrow(0, 0, 1),
+                    (start, _) => actions.narrow(0, start - 1, 1),
                 };
-                Tensor::cat(&[first, e.actions.narrow(0, *start, length - 1)], 0)
+                Tensor::cat(&[first, actions.narrow(0, *start, length - 1)], 0)
             })
             .collect();
         let actions = (Tensor::stack(&actions, 1) / &self.scale).to_device(device);

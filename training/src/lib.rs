@@ -4,6 +4,7 @@ pub mod ablation;
 pub mod adam;
 pub mod agent_slot;
 pub mod clips;
+pub mod dynamics;
 pub mod evaluation;
 pub mod events;
 pub mod journal;

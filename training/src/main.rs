@@ -61,8 +61,7 @@ enum Command {
     },
     /// Train a checkpoint by a recipe.
     Train {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects, tiny-finish or
-        /// tiny-long.
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, or one that goes on from it (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Data set.
@@ -88,8 +87,7 @@ enum Command {
     ///
     /// A run that was stopped goes on; one that is done is measured again.
     Ablate {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, tiny-refine, tiny-objects, tiny-finish or
-        /// tiny-long.
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, or one that goes on from it (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Variants to compare.
@@ -284,7 +282,8 @@ fn evaluate(
         let neutral = world.spec().neutral_action();
         let length = CONDITIONING + HORIZON;
         let recorded = Recorded::read(&dataset, &episodes, length, &neutral, Device::Cpu)?;
-        let scenes = rollout(&world, &recorded, &recorded.actions, Draw::Mean, wanted());
+        let actions = &recorded.actions;
+        let scenes = rollout(&world, &recorded, CONDITIONING, actions, Draw::Mean, wanted());
         picture::write(path, &recorded, &scenes, world.spec().agent_slot, 1)?;
     }
     Ok(())

@@ -7,7 +7,7 @@ use gatsbi_models::{
         loss,
         mixture::MixtureStep,
         model::{Gatsbi, GatsbiState, GradientStops, Observing},
-        objects::{Discover, ObjectStep, Rendering},
+        objects::{Discover, ObjectState, ObjectStep, Placed, Rendering},
     },
     noise::{Noise, PhiloxNoise, RowNoise, Site, philox4x32_10},
 };
@@ -38,20 +38,21 @@ pub struct Objective {
 }
 
 /// Weighted terms on their way to a loss.
-struct Terms {
+#[derive(Default)]
+pub(crate) struct Terms {
     entries: Vec<(&'static str, Tensor, f64)>,
 }
 
 impl Terms {
     /// Adds a term of `[B]`.
-    fn add(&mut self, name: &'static str, value: Tensor, weight: f64) {
+    pub(crate) fn add(&mut self, name: &'static str, value: Tensor, weight: f64) {
         match self.entries.iter_mut().find(|(known, _, _)| *known == name) {
             Some((_, sum, _)) => *sum = &*sum + value,
             None => self.entries.push((name, value, weight)),
         }
     }
 
-    fn finish(self, like: &Tensor) -> Objective {
+    pub(crate) fn finish(self, like: &Tensor) -> Objective {
         let mut loss = Tensor::zeros([1], (Kind::Float, like.device()));
         let mut terms = Vec::new();
         for (name, value, weight) in self.entries {
@@ -118,7 +119,7 @@ pub fn objective(
     moment: Moment,
 ) -> Objective {
     let step = moment.step;
-    let mut terms = Terms { entries: Vec::new() };
+    let mut terms = Terms::default();
     let keypoints = recipe.keypoints.as_ref().filter(|keypoints| step < keypoints.end);
     let gamma = match (keypoints, learning, model.detector()) {
         (Some(weights), Some(learning), Some(detector)) => {
@@ -206,6 +207,7 @@ fn add_scene(
             noise: noise(moment, t, rows, device),
             factor: recipe.mixture.noise.at(moment.step),
         };
+        let before = state.shallow_clone();
         let (next, seen) = if t < observed {
             model.observe(state, frame, &batch.actions[t], &noise, how)
         } else {
@@ -242,8 +244,28 @@ fn add_scene(
         add_regression(terms, &recipe.regression, &maps, agent.as_ref(), alpha, moment.step);
         if let (Some(objects), Some(rendering)) = (objects, &rendering) {
             add_composite(terms, objects, rendering, &seen.mixture, frame, moment.step, phase);
-            let known = (&state, &seen.mixture, seeing.as_ref());
-            add_places(terms, model, objects, known, frame, (moment.step, t));
+            let found = (t > 0 && objects.leads_to_found(moment.step)).then(|| {
+                let _no_grad = tch::no_grad_guard();
+                let found = model.objects().detect(frame, &seen.mixture.mu_mix);
+                model.objects().placed(&found)
+            });
+            let known = (&state.objects, seeing.as_ref().map(|believed| &believed.objects));
+            add_places(terms, model, objects, known, found.as_ref(), moment.step);
+            let weight = objects.catching.at(moment.step);
+            if let Some(found) = found.filter(|_| weight > 0.0 && phase == Phase::Observed) {
+                let jolts = jolts(&before, moment, t, pixels(model));
+                let noise: &dyn Noise = &noise;
+                let caught = model.follow(
+                    &before.objects.jolted(&jolts),
+                    (&before.mixture, &state.mixture),
+                    &seen.mixture,
+                    (frame, &batch.actions[t]),
+                    noise,
+                    &tracking,
+                );
+                let caught = model.objects().placed(&caught.z);
+                add_following(terms, "catching", (&caught, &found), weight, pixels(model));
+            }
             if let Some(found) = &seen.objects {
                 add_objects_kl(terms, model, objects, found, &first, moment.step);
             }
@@ -376,48 +398,66 @@ fn add_composite(
 }
 
 /// How near discovery must find an object to draw it, in pixels: as far as one is pushed in a frame.
-const FOLLOWING_REACH: f64 = 6.0;
+const FOLLOWING_REACH: f64 = 9.0;
 
 /// Distance from which on places that are missed count linearly, in pixels: less than half a push.
-const LENIENT: f64 = 3.0;
+pub(crate) const LENIENT: f64 = 3.0;
 
-/// Leads followed and imagined objects to what discovery finds, imagined ones to where they are `believed` to be when the
-/// frames are seen, and what is drawn of objects to the centres of their boxes.
+/// Largest standard deviation of how far boxes are moved off their objects to be caught again, in pixels. It is drawn for
+/// each, so that most lie near and some as far as the fastest pushes.
+const JOLT: f64 = 8.0;
+
+/// Pixels in half a side of the image, the unit of places.
+pub(crate) fn pixels(model: &Gatsbi) -> f64 {
+    model.config().image_size as f64 / 2.0
+}
+
+/// Leads objects to what discovery `found`, imagined ones to how and where they are `believed` to be when the frames are
+/// seen, and what is drawn of objects to the centres of their boxes.
 fn add_places(
     terms: &mut Terms,
     model: &Gatsbi,
     recipe: &ObjectRecipe,
-    (state, mixture, believed): (&GatsbiState, &MixtureStep, Option<&GatsbiState>),
-    frame: &Tensor,
-    (step, t): (u64, usize),
+    (known, believed): (&ObjectState, Option<&ObjectState>),
+    found: Option<&Placed>,
+    step: u64,
 ) {
-    // What was found in the first frame is where discovery finds it.
-    let following = if t > 0 { recipe.following.at(step) } else { 0.0 };
-    let centring = recipe.centring.at(step);
-    if following == 0.0 && centring == 0.0 && believed.is_none() {
-        return;
-    }
-    let pixels = model.config().image_size as f64 / 2.0;
-    let placed = |z: &Tensor| model.objects().placed(z);
-    let mut add = |name, distance: Tensor, weight| {
-        terms.add(name, distance * pixels.powi(2), weight);
-    };
-    let objects = placed(&state.objects.z);
-    add("centring", loss::centring(&objects), centring);
-    if following > 0.0 {
-        let found = {
-            let _no_grad = tch::no_grad_guard();
-            placed(&model.objects().detect(frame, &mixture.mu_mix))
-        };
-        let (reach, scale) = (FOLLOWING_REACH / pixels, LENIENT / pixels);
-        add("following", loss::following(&objects, &found, reach, scale), following);
+    let pixels = pixels(model);
+    let objects = model.objects().placed(&known.z);
+    let squared = pixels.powi(2);
+    terms.add("centring", loss::centring(&objects) * squared, recipe.centring.at(step));
+    if let Some(found) = found {
+        add_following(terms, "following", (&objects, found), recipe.following.at(step), pixels);
     }
     if let Some(believed) = believed {
-        let seen = placed(&believed.objects.z);
-        let (ids, seen_ids) = (&state.objects.ids, &believed.objects.ids);
-        let distance = loss::foresight((&objects, ids), (&seen, seen_ids), LENIENT / pixels);
-        add("foresight", distance, recipe.foresight.at(step));
+        let seen = model.objects().placed(&believed.z);
+        let (imagined, seen) = ((&objects, &known.ids), (&seen, &believed.ids));
+        let distance = loss::foresight(imagined, seen, LENIENT / pixels) * squared;
+        terms.add("foresight", distance, recipe.foresight.at(step));
+        terms.add("lasting", loss::lasting(imagined, seen), recipe.lasting.at(step));
     }
+}
+
+/// Leads objects to what was found near them.
+fn add_following(
+    terms: &mut Terms,
+    name: &'static str,
+    (objects, found): (&Placed, &Placed),
+    weight: f64,
+    pixels: f64,
+) {
+    let (reach, scale) = (FOLLOWING_REACH / pixels, LENIENT / pixels);
+    terms.add(name, loss::following(objects, found, reach, scale) * pixels.powi(2), weight);
+}
+
+/// How far boxes are moved off their objects before frame `t`, `[B, N, 2]`.
+fn jolts(state: &GatsbiState, moment: Moment, t: usize, pixels: f64) -> Tensor {
+    let size = state.objects.z.size();
+    // From a stream of their own, as keypoints are.
+    let moment = Moment { seed: moment.seed.rotate_left(32) ^ 0x6a6f_6c74, ..moment };
+    let noise = noise(moment, t, size[0], state.objects.z.device());
+    let spread = noise.uniform(Site::Presence, &[size[0], size[1], 1]).square() * (JOLT / pixels);
+    noise.normal(Site::Where, &[size[0], size[1], 2]) * spread
 }
 
 fn add_objects_kl(

@@ -8,10 +8,10 @@ use anyhow::{Context as _, ensure};
 use gatsbi_models::gatsbi::keypoint::KeypointLearningConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::variant::Variant;
+use crate::{dynamics::HORIZON, variant::Variant};
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 11] = [
+const NAMED: [(&str, &str); 15] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -22,7 +22,25 @@ const NAMED: [(&str, &str); 11] = [
     ("tiny-objects", include_str!("../recipes/tiny-objects.toml")),
     ("tiny-finish", include_str!("../recipes/tiny-finish.toml")),
     ("tiny-long", include_str!("../recipes/tiny-long.toml")),
+    ("tiny-catching", include_str!("../recipes/tiny-catching.toml")),
+    ("tiny-sight", include_str!("../recipes/tiny-sight.toml")),
+    ("tiny-following", include_str!("../recipes/tiny-following.toml")),
+    ("tiny-dynamics", include_str!("../recipes/tiny-dynamics.toml")),
     ("tiny-foresight", include_str!("../recipes/tiny-foresight.toml")),
+];
+
+/// Parts of the names of parameters that objects are imagined with; the surroundings (the last three) are also there for
+/// following.
+const IMAGINING: [&str; 9] = [
+    "latent_prior_prop",
+    "self_prior",
+    "relational_prior",
+    "weights_prior",
+    "rnn_prior",
+    "init_prior",
+    "bg_attention_encoder",
+    "objects.ambient",
+    "objects.agent",
 ];
 
 /// How a model is trained.
@@ -60,6 +78,8 @@ pub struct Recipe {
     pub regression: RegressionRecipe,
     /// Keypoint module; none is trained without it.
     pub keypoints: Option<KeypointRecipe>,
+    /// First steps in which nothing but what is imagined of objects learns.
+    pub dynamics: Option<DynamicsRecipe>,
     /// Steps between pictures.
     pub picture_every: u64,
     /// Steps between checkpoints.
@@ -110,6 +130,12 @@ impl Recipe {
                  observed at least"
             );
         }
+        for (step, length) in recipe.dynamics.iter().flat_map(|dynamics| &dynamics.length.0) {
+            ensure!(
+                (1.0..=HORIZON as f64).contains(length),
+                "dynamics.length is {length} from step {step} on, expected 1 to {HORIZON}"
+            );
+        }
         Ok(recipe)
     }
 
@@ -125,10 +151,19 @@ impl Recipe {
             .is_some_and(|objects| (objects.start..objects.alone_until).contains(&step))
     }
 
+    /// How dynamics are learned at `step`, if nothing else is.
+    pub fn dynamics_alone(&self, step: u64) -> Option<&DynamicsRecipe> {
+        self.dynamics.as_ref().filter(|dynamics| step < dynamics.until)
+    }
+
     /// Learning rate of the parameter called `name` at `step`; 0 if it rests.
     pub fn rate_of(&self, name: &str, step: u64) -> f64 {
         let rate = self.learning_rate.at(step);
         match &self.objects {
+            _ if self.dynamics_alone(step).is_some() => {
+                let imagines = IMAGINING.iter().any(|part| name.contains(part));
+                if imagines { rate } else { 0.0 }
+            }
             Some(objects) if name.starts_with("objects.") => rate * objects.rate.at(step),
             _ if self.objects_alone(step) => 0.0,
             _ => rate,
@@ -150,6 +185,24 @@ pub struct KeypointRecipe {
     pub kl: Ramp,
     /// Sizes of the networks.
     pub networks: KeypointLearningConfig,
+}
+
+/// The objects' dynamics, learned from what the model remembers of its data ([`crate::dynamics`]).
+#[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct DynamicsRecipe {
+    /// First step without.
+    pub until: u64,
+    /// Sequences per step.
+    pub batch: i64,
+    /// Frames that each foresees, from the given step on; [`crate::dynamics::HORIZON`] at most.
+    pub length: Staircase,
+    /// Weight, in nats a squared pixel, of the distance between boxes that are imagined and the remembered ones.
+    pub place: Ramp,
+    /// Weight, in nats, of the squared distance between their appearances.
+    pub what: Ramp,
+    /// Weight of the KL of the dynamics latents.
+    pub kl: Ramp,
 }
 
 /// The last slot's component is fitted to the data's background through its own posterior.
@@ -214,16 +267,31 @@ pub struct ObjectRecipe {
     /// learn them from the likelihood.
     #[serde(default)]
     pub following: Ramp,
+    /// Weight of the same distance of objects that were followed from boxes that lay beside them: what lags behind in one
+    /// frame is to be caught in the next. Pushes alone are too rare to teach that.
+    #[serde(default)]
+    pub catching: Ramp,
     /// Weight, in nats a squared pixel, of the distance between an object that is imagined and where it is followed to when
     /// the frames are seen. It reaches as far as objects are pushed; what is found near where one is imagined does not.
     #[serde(default)]
     pub foresight: Ramp,
+    /// Weight, in nats, of the squared difference between what is drawn of an object that is imagined and when the frames
+    /// are seen, mean over pixels.
+    #[serde(default)]
+    pub lasting: Ramp,
     /// Weight, in nats a squared pixel, of the distance between what is drawn of an object and the centre of its box:
     /// nothing else holds a box to its object once following leads what is drawn.
     #[serde(default)]
     pub centring: Ramp,
     /// Mean of the raw scale in the discovery prior.
     pub scale_mean: Ramp,
+}
+
+impl ObjectRecipe {
+    /// Whether anything is led to what discovery finds at `step`.
+    pub(crate) fn leads_to_found(&self, step: u64) -> bool {
+        [&self.following, &self.catching].into_iter().any(|weight| weight.at(step) > 0.0)
+    }
 }
 
 /// The fixed-alpha window.
@@ -340,6 +408,13 @@ mod tests {
                 tiny.replace("imagined = ", "imagined = [[0, 3]] # "),
                 "3 of 3 frames are imagined from step 0 on",
             ),
+            (
+                format!(
+                    "{tiny}\n[dynamics]\nuntil = 5\nbatch = 2\nlength = [[0, 4], [3, 16]]\n\
+                     place = 1.0\nwhat = 1.0\nkl = 1.0\n"
+                ),
+                "dynamics.length is 16 from step 3 on, expected 1 to 15",
+            ),
         ];
         for (text, expected) in wrong {
             let error = format!("{:#}", Recipe::parse(&text).unwrap_err());
@@ -347,7 +422,7 @@ mod tests {
         }
         let error = format!("{:#}", Recipe::load("no-such-recipe").unwrap_err());
         let names =
-            "balls, tiny, tiny-refine, tiny-objects, tiny-finish, tiny-long, tiny-foresight";
+            "tiny-long, tiny-catching, tiny-sight, tiny-following, tiny-dynamics, tiny-foresight";
         assert!(error.contains(names), "{error}");
     }
 }

@@ -25,7 +25,8 @@ use crate::{
     adam::{self, Adam},
     agent_slot::Vote,
     clips::{Batch, Clips},
-    evaluation::{self, Draw, Recorded},
+    dynamics::{self, Remembered},
+    evaluation::{self, CONDITIONING, Draw, Recorded},
     journal::Journal,
     objective::{Moment, noise, objective, training_tracking},
     recipe::Recipe,
@@ -41,6 +42,9 @@ const RECALIBRATION_BATCHES: u64 = 30;
 
 /// Batches whose frames vote for the agent's slot.
 const VOTING_BATCHES: u64 = 20;
+
+/// Episodes between lines that tell how far remembering is.
+const REMEMBERED_TOLD_EVERY: usize = 160;
 
 /// Optimiser steps of the prefit draw from steps of their own, far from those of the run.
 const PREFIT_STEPS: u64 = 1 << 40;
@@ -78,6 +82,12 @@ impl Trainer {
             recipe.longest() <= clips.shortest() as u64,
             "the recipe's sequences have up to {} frames, the shortest episode {}",
             recipe.longest(),
+            clips.shortest()
+        );
+        ensure!(
+            recipe.dynamics.is_none() || clips.shortest() > dynamics::SHORTEST,
+            "dynamics are learned from episodes of more than {} frames, the shortest has {}",
+            dynamics::SHORTEST,
             clips.shortest()
         );
         model.action.dim = clips.actions.len() as i64;
@@ -132,8 +142,9 @@ impl Trainer {
             let header = self.checkpoint.header.clone();
             let mut theirs =
                 GatsbiConfig { tracking: header.model.tracking, ..loaded.header.model };
-            // Neither decides what parameters there are.
+            // None of these decides what parameters there are.
             theirs.objects.agent_feature = header.model.objects.agent_feature;
+            theirs.objects.rejection = header.model.objects.rejection;
             ensure!(theirs == header.model, "{} has another architecture", path.display());
             self.checkpoint = Checkpoint { header, ..loaded };
             self.recipe.prefit = None;
@@ -158,17 +169,31 @@ impl Trainer {
             self.prefit(clips, &journal);
         }
         let mut skipped_in_a_row = 0;
+        let mut remembered = None;
         while self.progress.step < end {
             let started = Instant::now();
             let moment = self.moment();
-            let length = self.recipe.length.at(moment.step) as i64;
-            let batch = self.batch(clips, moment.step, length);
-            let learning = self.learning.as_ref();
             let stores = [&self.checkpoint.store, &self.learning_store];
             let rate = |name: &str| self.recipe.rate_of(name, moment.step);
-            adam::select(&stores, |name| rate(name) > 0.0);
-            let objective =
-                objective(&self.checkpoint.model, learning, &self.recipe, &batch, moment);
+            let (model, device) = (&self.checkpoint.model, self.device);
+            let (rows, length, objective) =
+                if let Some(recipe) = self.recipe.dynamics_alone(moment.step) {
+                    let remembered = match &mut remembered {
+                        Some(remembered) => remembered,
+                        none => none.insert(self.remembered(clips, &journal)?),
+                    };
+                    adam::select(&stores, |name| rate(name) > 0.0);
+                    let objective = dynamics::objective(model, remembered, recipe, moment, device);
+                    (recipe.batch, recipe.length.at(moment.step), objective)
+                } else {
+                    self.forget();
+                    let length = self.recipe.length.at(moment.step);
+                    let batch = self.batch(clips, moment.step, length as i64);
+                    adam::select(&stores, |name| rate(name) > 0.0);
+                    let learning = self.learning.as_ref();
+                    let objective = objective(model, learning, &self.recipe, &batch, moment);
+                    (self.recipe.batch, length, objective)
+                };
             let loss = objective.loss.double_value(&[]);
             let mut norm = f64::NAN;
             if loss.is_finite() {
@@ -178,11 +203,10 @@ impl Trainer {
             self.progress.step += 1;
             if norm.is_finite() {
                 skipped_in_a_row = 0;
-                let frames = length as f64;
                 let terms = objective.terms.iter();
-                let numbers = terms.map(|(name, value)| (*name, value.double_value(&[]) / frames));
-                let all = [("loss", loss / frames), ("norm", norm)].into_iter().chain(numbers);
-                journal.step(self.progress.step, frames * self.recipe.batch as f64, all)?;
+                let numbers = terms.map(|(name, value)| (*name, value.double_value(&[]) / length));
+                let all = [("loss", loss / length), ("norm", norm)].into_iter().chain(numbers);
+                journal.step(self.progress.step, length * rows as f64, all)?;
             } else {
                 self.progress.skipped += 1;
                 skipped_in_a_row += 1;
@@ -216,6 +240,31 @@ impl Trainer {
 
     fn state_path(&self) -> PathBuf {
         self.folder.join("state.safetensors")
+    }
+
+    fn remembered_path(&self) -> PathBuf {
+        self.folder.join("remembered.safetensors")
+    }
+
+    /// What the model made of the data before its dynamics learned; that a resumed run cannot see again.
+    fn remembered(&self, clips: &Clips, journal: &Journal) -> anyhow::Result<Remembered> {
+        let path = self.remembered_path();
+        if path.exists() {
+            return Remembered::read(&path, clips);
+        }
+        let told = |seen| {
+            if seen % REMEMBERED_TOLD_EVERY == 0 {
+                journal.say(&format!("{seen} of {} episodes are remembered", clips.len()));
+            }
+        };
+        let remembered = Remembered::by(&self.checkpoint.model, clips, self.device, told);
+        remembered.write(&path)?;
+        Ok(remembered)
+    }
+
+    /// Removes what is of no use any more.
+    fn forget(&self) {
+        fs_err::remove_file(self.remembered_path()).ok();
     }
 
     fn moment(&self) -> Moment {
@@ -354,6 +403,7 @@ impl Trainer {
         let scenes = evaluation::rollout(
             &world,
             &recorded,
+            CONDITIONING,
             &recorded.actions,
             Draw::Mean,
             evaluation::wanted(),

@@ -9,32 +9,40 @@ use gatsbi_models::checkpoint::{Checkpoint, Header};
 use gatsbi_training::{clips::Clips, recipe::Recipe, trainer::Trainer};
 use tch::{Device, Tensor};
 
-const STEPS: u64 = 4;
+const STEPS: u64 = 6;
 
-/// Every stage in four steps: background prefit, mixture, objects alone, all together, with keypoints.
+/// Every stage in six steps: background prefit, remembered dynamics, mixture, objects alone, all together, with keypoints.
 const RECIPE: &str = r#"
 name = "resumed"
 model = "tiny"
-steps = 4
+steps = 6
 batch = 2
-length = [[0, 2], [3, 3]]
-learning_rate = [[0, 1e-3], [2, 5e-4]]
+length = [[0, 2], [5, 3]]
+learning_rate = [[0, 1e-3], [4, 5e-4]]
 clip = 1.0
 picture_every = 0
 save_every = 2
 prefit = { steps = 2, learning_rate = 1e-3 }
 
+[dynamics]
+until = 2
+batch = 3
+length = [[0, 3]]
+place = 1.0
+what = 1.0
+kl = 0.1
+
 [mixture]
 start = 0
 sigma = 0.1
-likelihood = [[0, 1.0], [2, 0.5]]
-kl = [[0, 0.0], [4, 1.0]]
+likelihood = [[0, 1.0], [4, 0.5]]
+kl = [[2, 0.0], [6, 1.0]]
 residual = 0.01
 noise = 1.0
 
 [objects]
-start = 1
-alone_until = 2
+start = 3
+alone_until = 4
 rate = 2.0
 scale_bounds = [0.04, 0.3]
 sigma = 0.1
@@ -51,7 +59,7 @@ foreground = 1.0
 objects = 1.0
 
 [keypoints]
-end = 3
+end = 5
 separation = 20.0
 sparsity = 0.002
 kl = 0.001
@@ -81,7 +89,7 @@ fn a_resumed_run_ends_where_an_uninterrupted_one_does() {
     let clips = Clips::read(&Dataset::open(sample).unwrap(), 0..2).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let once = trained(&clips, &folder.path().join("once"), &[STEPS]);
-    let resumed = trained(&clips, &folder.path().join("resumed"), &[1, 2, STEPS]);
+    let resumed = trained(&clips, &folder.path().join("resumed"), &[1, 3, 4, STEPS]);
     assert!(once == resumed, "the resumed run ended with other weights");
     let other = trained(&clips, &folder.path().join("other"), &[STEPS - 1]);
     assert!(once != other, "the last step changed nothing");

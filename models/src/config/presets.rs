@@ -111,8 +111,9 @@ pub fn tiny() -> GatsbiConfig {
                 channels: vec![32, 16, 8],
                 groups: vec![2, 1, 1],
             },
-            // Detectors drop second boxes at 0.3 to 0.5 by convention: at 0.5 many are second ones on an object that has moved.
-            rejection: Some(0.3),
+            // Detectors drop second boxes at 0.3 to 0.5 by convention, but boxes are close around objects: what overlaps less is
+            // often the same object, moved and about to be followed.
+            rejection: Some(0.1),
             // An action moves the hand and what it pushes in the same step.
             agent_feature: AgentFeature::Next,
             ..objects(4, 7)

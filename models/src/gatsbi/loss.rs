@@ -91,6 +91,27 @@ const SAME_COLOUR: f64 = 0.1;
 /// as `reach` and `scale` are. Only the objects' centres get a gradient.
 pub fn following(objects: &Placed, found: &Placed, reach: f64, scale: f64) -> Tensor {
     let distance = squared_distances(objects, found);
+    let weight = likely_finds(objects, found, &distance, reach, scale);
+    sum(&(weight * lenient(&distance, scale) * objects.presence.detach()))
+}
+
+/// How surely each object is where it is thought to be, `[B, N]` in [0, 1]: it is among what was found there, of its colour,
+/// and no other object is. `reach` and `scale` are as in [`following`]; there is no gradient.
+pub fn confirmed(objects: &Placed, found: &Placed, reach: f64, scale: f64) -> Tensor {
+    let distance = squared_distances(objects, found);
+    let weight = likely_finds(objects, found, &distance, reach, scale);
+    weight.sum_dim_intlist(-1, false, Kind::Float)
+}
+
+/// How likely each object is each of what was `found` at squared distances `[B, N, D]`, `[B, N, D]` in [0, 1] without a
+/// gradient; sums to less than 1 over finds, and to 0 where there is none.
+fn likely_finds(
+    objects: &Placed,
+    found: &Placed,
+    distance: &Tensor,
+    reach: f64,
+    scale: f64,
+) -> Tensor {
     let far = distance.detach();
     let other = objects.colour.unsqueeze(2) - found.colour.unsqueeze(1); // [B, N, D, 3]
     let other = other.detach().square().sum_dim_intlist(-1, false, Kind::Float);
@@ -103,26 +124,46 @@ pub fn following(objects: &Placed, found: &Placed, reach: f64, scale: f64) -> Te
     let near: Tensor = (unlike * -0.5).exp() * detected * (1.0 - by_others);
     // As much as a detection at twice the reach: beyond it the weights fade.
     let nowhere = (-2.0_f64).exp();
-    let weight = &near / (near.sum_dim_intlist(-1, true, Kind::Float) + nowhere);
-    sum(&(weight * lenient(&distance, scale) * presence))
+    &near / (near.sum_dim_intlist(-1, true, Kind::Float) + nowhere)
 }
 
 /// Distances between where objects are imagined and where they are when they are seen, `[B]`, summed over pairs of the same
 /// identity as far as both are present; multi-step predictions are judged by what is inferred from the frames, as in latent
 /// overshooting (Hafner et al. 2019).
 ///
-/// Distances count as in [`lenient`] and are in units of the image's half side, as `scale` is. Identities are `[B, N]` and
-/// `[B, M]` int64, negative in slots that were never filled. Only the imagined objects' centres get a gradient.
-pub fn foresight(
-    (imagined, imagined_ids): (&Placed, &Tensor),
-    (seen, seen_ids): (&Placed, &Tensor),
-    scale: f64,
-) -> Tensor {
-    let distance = lenient(&squared_distances(imagined, seen), scale);
-    let ids = imagined_ids.unsqueeze(2);
-    let same = ids.eq_tensor(&seen_ids.unsqueeze(1)).logical_and(&ids.ge(0));
-    let both = imagined.presence.detach() * seen.presence.detach().transpose(1, 2); // [B, N, M]
-    sum(&(distance * both * same.to_kind(Kind::Float)))
+/// Distances count as in [`lenient`] and are in units of the image's half side, as `scale` is. Only the imagined objects'
+/// centres get a gradient.
+pub fn foresight(imagined: Identified<'_>, seen: Identified<'_>, scale: f64) -> Tensor {
+    let distance = lenient(&squared_distances(imagined.0, seen.0), scale);
+    sum(&(distance * same_objects(imagined, seen)))
+}
+
+/// Squared differences between what is drawn of objects when they are imagined and when they are seen, mean over pixels of
+/// the glimpse, `[B]`, summed over channels and over the pairs of [`foresight`]. The image alone would have objects fade
+/// where it is not sure of their places. Only what is drawn of imagined objects gets a gradient.
+pub fn lasting(imagined: Identified<'_>, seen: Identified<'_>) -> Tensor {
+    let difference = imagined.0.drawn.unsqueeze(2) - seen.0.drawn.detach().unsqueeze(1); // [B, N, M, 4, s, s]
+    let pixels = [4i64, 5].as_slice();
+    let difference = difference.square().mean_dim(pixels, false, Kind::Float);
+    let difference = difference.sum_dim_intlist(-1, false, Kind::Float);
+    sum(&(difference * same_objects(imagined, seen)))
+}
+
+/// Objects and their identities, `[B, N]` int64, negative in slots that were never filled.
+type Identified<'a> = (&'a Placed, &'a Tensor);
+
+/// How far two objects are the same and both present, `[B, N, M]` in [0, 1], without a gradient.
+fn same_objects((some, ids): Identified<'_>, (others, other_ids): Identified<'_>) -> Tensor {
+    let ids = ids.unsqueeze(2);
+    let same = ids.eq_tensor(&other_ids.unsqueeze(1)).logical_and(&ids.ge(0));
+    let both = some.presence.detach() * others.presence.detach().transpose(1, 2);
+    both * same.to_kind(Kind::Float)
+}
+
+/// Distances between places `[..., 2]`, each as in [`lenient`] with a `scale` in their unit, `[...]`.
+pub fn displacement(some: &Tensor, others: &Tensor, scale: f64) -> Tensor {
+    let squared = (some - others).square().sum_dim_intlist(-1, false, Kind::Float);
+    lenient(&squared, scale)
 }
 
 /// Distances that count squared up to about `scale` and linearly beyond it (pseudo-Huber), of squared ones: an object that is
@@ -160,8 +201,14 @@ mod tests {
     fn placed(objects: &[[f32; 5]]) -> Placed {
         let all = Tensor::from_slice(&objects.concat()).view([1, -1, 5]);
         let part = |from, width| all.narrow(-1, from, width).copy();
-        let colour = Tensor::full([1, objects.len() as i64, 3], 0.5, (Kind::Float, Device::Cpu));
-        Placed { presence: part(0, 1), centre: part(1, 2), offset: part(3, 2), colour }
+        let (count, grey) = (objects.len() as i64, (Kind::Float, Device::Cpu));
+        Placed {
+            presence: part(0, 1),
+            centre: part(1, 2),
+            offset: part(3, 2),
+            colour: Tensor::full([1, count, 3], 0.5, grey),
+            drawn: Tensor::full([1, count, 4, 2, 2], 0.5, grey),
+        }
     }
 
     /// What a distance counts with a scale of 2.
@@ -188,6 +235,9 @@ mod tests {
         let near = (-0.5_f64 * 4.0 / 16.0).exp();
         let weight = near / (near + (-2.0_f64).exp());
         assert!((loss.double_value(&[0]) - lenient_2(2.0) * weight).abs() < 1e-3, "{loss}");
+        let sure = confirmed(&objects, &found, 4.0, 2.0);
+        assert!((sure.double_value(&[0, 0]) - weight).abs() < 1e-3, "{sure}");
+        assert!(sure.double_value(&[0, 1]) < 1e-3, "{sure}");
         loss.sum(Kind::Float).backward();
         let gradient = objects.centre.grad();
         let of = |object: i64| gradient.double_value(&[0, object, 0]);
@@ -225,6 +275,22 @@ mod tests {
             assert!((of(0, axis) + off * slope_2(5.0)).abs() < 1e-4, "{gradient}");
         }
         assert!(of(1, 0).abs() < 1e-6 && of(1, 1).abs() < 1e-6, "{gradient}");
+    }
+
+    #[test]
+    fn an_imagined_object_is_led_to_how_the_same_one_is_seen() {
+        let object = |pres: f32| [pres, 10.0, 20.0, 0.0, 0.0];
+        let mut imagined = placed(&[object(1.0), object(1.0)]);
+        imagined.drawn = imagined.drawn.set_requires_grad(true);
+        let mut seen = placed(&[object(0.5), object(1.0)]);
+        let channels = Tensor::from_slice(&[0.5f32, 0.7, 0.5, 0.9]).view([1, 1, 4, 1, 1]);
+        seen.drawn = channels.expand([1, 2, 4, 2, 2], false);
+        let ids = |ids: [i64; 2]| Tensor::from_slice(&ids).unsqueeze(0);
+        let loss = lasting((&imagined, &ids([4, -1])), (&seen, &ids([4, -1])));
+        assert!((loss.double_value(&[0]) - 0.5 * (0.04 + 0.16)).abs() < 1e-6, "{loss}");
+        loss.sum(Kind::Float).backward();
+        let of = |object: i64| imagined.drawn.grad().double_value(&[0, object, 3, 0, 0]);
+        assert!((of(0) + 0.5 * 2.0 * 0.4 / 4.0).abs() < 1e-6 && of(1).abs() < 1e-9, "{}", of(0));
     }
 
     #[test]

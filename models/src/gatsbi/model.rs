@@ -89,6 +89,8 @@ pub struct GatsbiStep {
     pub mixture: MixtureStep,
     /// Objects, while observing with the object module on.
     pub objects: Option<ObjectStep>,
+    /// The agent as the objects saw it; absent in scenes without one, and with the object module off.
+    pub agent: Option<Agent>,
 }
 
 /// GATSBI with all parameters.
@@ -185,7 +187,7 @@ impl Gatsbi {
             self.mixture.observe(before, frame, &action, &first, noise, priors, train);
         if !objects {
             let state = GatsbiState { mixture, objects: state.objects, step: state.step + 1 };
-            return (state, GatsbiStep { mixture: step, objects: None });
+            return (state, GatsbiStep { mixture: step, objects: None, agent: None });
         }
         let agent = self.agent(before, &mixture, &action, stops.agent);
         let [residual_mix, environment_mix] = [stops.residual, stops.environment]
@@ -199,7 +201,7 @@ impl Gatsbi {
         let (objects, object_step) =
             self.objects.observe(&state.objects, &scenery, discover, noise, &tracking, train);
         let state = GatsbiState { mixture, objects, step: state.step + 1 };
-        (state, GatsbiStep { mixture: step, objects: Some(object_step) })
+        (state, GatsbiStep { mixture: step, objects: Some(object_step), agent })
     }
 
     /// Predicts a step under an action.
@@ -220,7 +222,7 @@ impl Gatsbi {
         let objects =
             self.objects.imagine(&state.objects, &step.mu_mix, agent.as_ref(), noise, tracking);
         let state = GatsbiState { mixture, objects, step: state.step + 1 };
-        (state, GatsbiStep { mixture: step, objects: None })
+        (state, GatsbiStep { mixture: step, objects: None, agent })
     }
 
     /// Passes over a frame that never came: predicted like [`Gatsbi::imagine`], and what was predicted is
@@ -239,7 +241,31 @@ impl Gatsbi {
         let objects =
             self.objects.skip(&state.objects, &step.mu_mix, agent.as_ref(), noise, tracking);
         let state = GatsbiState { mixture, objects, step: state.step + 1 };
-        (state, GatsbiStep { mixture: step, objects: None })
+        (state, GatsbiStep { mixture: step, objects: None, agent })
+    }
+
+    /// Known objects followed into a frame that the mixture has absorbed in the step from `before` to `after`, wherever
+    /// their boxes are thought to be; nothing new is looked for.
+    ///
+    /// # Shapes
+    /// Those of [`Gatsbi::observe`].
+    pub fn follow(
+        &self,
+        objects: &ObjectState,
+        (before, after): (&MixtureState, &MixtureState),
+        seen: &MixtureStep,
+        (frame, action): (&Tensor, &Tensor),
+        noise: &dyn Noise,
+        tracking: &Tracking,
+    ) -> ObjectState {
+        let agent = self.agent(before, after, &self.enhance(action), true);
+        let scenery = Scenery {
+            frame,
+            residual_mix: &seen.mu_mix,
+            environment_mix: &seen.mu_mix,
+            agent: agent.as_ref(),
+        };
+        self.objects.observe(objects, &scenery, Discover::None, noise, tracking, false).0
     }
 
     /// The object module.

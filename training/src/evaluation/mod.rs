@@ -108,10 +108,11 @@ impl Draw {
     }
 }
 
-/// Observes the first frames and imagines the rest, with `actions` from then on.
+/// Observes the first `observed` frames and imagines the rest, with `actions` from then on.
 pub fn rollout(
     world: &dyn WorldModel,
     recorded: &Recorded,
+    observed: usize,
     actions: &[Tensor],
     draw: Draw,
     wanted: Outputs,
@@ -121,7 +122,7 @@ pub fn rollout(
     let mut scenes = Vec::new();
     for (t, action) in actions.iter().enumerate() {
         let noise = draw.noise(batch, t, world.device());
-        let (next, scene) = if t < CONDITIONING {
+        let (next, scene) = if t < observed {
             world.observe(&state, Some(&recorded.frames[t]), action, &noise, wanted)
         } else {
             world.imagine(&state, action, &noise, wanted)

@@ -1,5 +1,5 @@
-//! How much of the objects' motion is foreseen: imagined displacements since the last observed frame beside the true ones,
-//! of objects that did move.
+//! How much of the objects' motion is foreseen or followed: displacements since a frame beside the true ones, of objects
+//! that did move.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ const MOVED_PIXELS: f64 = 2.0;
 
 type Point = [f64; 2];
 
-/// The objects of one episode at the last observed frame.
+/// The objects of one episode at the frame that displacements are measured from.
 #[derive(Debug)]
 pub struct Starts {
     /// Identity, found and true centre by label.
@@ -23,12 +23,16 @@ pub struct Starts {
 /// Over objects that have moved: how many, and sums of distances in pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Motion {
-    /// Objects that have moved and are still imagined.
+    /// Objects that have moved.
     pub moved: usize,
-    /// Between the imagined displacement and the true one.
+    /// Those of them that still have their identity; the rest is about these.
+    pub kept: usize,
+    /// Between the believed displacement and the true one.
     pub error: f64,
     /// Between none and the true one.
     pub still: f64,
+    /// Of the believed displacement, along the true one.
+    pub way: f64,
 }
 
 impl Starts {
@@ -41,20 +45,24 @@ impl Starts {
         Self { objects: objects.collect() }
     }
 
-    /// What has moved up to an imagined frame whose labels are `[H, W]`.
+    /// What has moved up to a later frame whose labels are `[H, W]`.
     pub fn step(&self, scene: &Scene, labels: &Tensor, row: i64) -> Motion {
         let (found, truth) = centres(scene, labels, row);
         let mut motion = Motion::default();
         for (label, (identity, found_then, truth_then)) in &self.objects {
-            let (Some(found), Some(truth)) = (found.get(identity), truth.get(label)) else {
+            let Some(actual) = truth.get(label).map(|truth| minus(truth, truth_then)) else {
                 continue;
             };
-            let (imagined, actual) = (minus(found, found_then), minus(truth, truth_then));
             let still = length(actual);
-            if still >= MOVED_PIXELS {
-                motion.moved += 1;
-                motion.error += length(minus(&imagined, &actual));
+            if still < MOVED_PIXELS {
+                continue;
+            }
+            motion.moved += 1;
+            if let Some(believed) = found.get(identity).map(|found| minus(found, found_then)) {
+                motion.kept += 1;
+                motion.error += length(minus(&believed, &actual));
                 motion.still += still;
+                motion.way += (believed[0] * actual[0] + believed[1] * actual[1]) / still;
             }
         }
         motion
@@ -92,8 +100,15 @@ mod tests {
         let starts = Starts::new(&[(2, 7), (3, 9)], &scene([10.5, 41.5]), &labels([8, 40]), 0);
         // Label 2 moves by six pixels and is imagined to move by four; label 3 rests.
         let motion = starts.step(&scene([14.5, 47.5]), &labels([14, 40]), 0);
-        assert_eq!(motion.moved, 1);
+        assert_eq!((motion.moved, motion.kept), (1, 1));
         assert!((motion.error - 2.0).abs() < 1e-4, "{motion:?}");
         assert!((motion.still - 6.0).abs() < 1e-4, "{motion:?}");
+        assert!((motion.way - 4.0).abs() < 1e-4, "{motion:?}");
+        // Of an object whose identity is lost nothing but that is counted.
+        let mut lost = scene([14.5, 47.5]);
+        let table = lost.objects.as_mut().expect("a table");
+        table.ids = Tensor::from_slice(&[8i64, 9]).view([1, 2]);
+        let lost = starts.step(&lost, &labels([14, 40]), 0);
+        assert_eq!(lost, Motion { moved: 1, ..Motion::default() });
     }
 }

@@ -16,7 +16,7 @@ use tch::Tensor;
 use super::{
     CONDITIONING, Draw, Recorded, decomposition, images,
     interaction::Followed,
-    motion::Starts,
+    motion::{Motion, Starts},
     perceptual::{Perceptual, frechet_distance},
     rollout,
     statistics::{Estimate, PerEpisode},
@@ -149,10 +149,13 @@ pub fn report(
     let indices: Vec<usize> = range.clone().collect();
     for (chunk, episodes) in indices.chunks(BATCH).enumerate() {
         let recorded = Recorded::read(dataset, episodes, length, &neutral, world.device())?;
-        let scenes = rollout(world, &recorded, &recorded.actions, Draw::Mean, wanted());
+        let scenes =
+            rollout(world, &recorded, CONDITIONING, &recorded.actions, Draw::Mean, wanted());
         let swapped = swapped_actions(&recorded);
         let only_frames = Outputs::from_iter([Output::Frame]);
-        let others = rollout(world, &recorded, &swapped, Draw::Mean, only_frames);
+        let only_objects = Outputs::from_iter([Output::Objects]);
+        let seen = rollout(world, &recorded, length, &recorded.actions, Draw::Mean, only_objects);
+        let others = rollout(world, &recorded, CONDITIONING, &swapped, Draw::Mean, only_frames);
         let first_episode = chunk * BATCH;
         let mut identities = HashMap::new();
         let (mut followed, mut starts) = (Vec::new(), Vec::new());
@@ -174,11 +177,11 @@ pub fn report(
                     starts = matches.iter().enumerate().map(start).collect();
                 } else if t >= CONDITIONING {
                     for (row, starts) in starts.iter().enumerate() {
-                        let motion = starts.step(&scenes[t], &labels(row), row as i64);
+                        let step =
+                            |scenes: &[Scene]| starts.step(&scenes[t], &labels(row), row as i64);
                         let episode = first_episode + row;
-                        let moved = motion.moved as f64;
-                        tally.ratio("moved_object_px_imagined", episode, motion.error, moved);
-                        tally.ratio("moved_object_px_still", episode, motion.still, moved);
+                        add_motion(&mut tally, episode, "imagined", step(&scenes));
+                        add_motion(&mut tally, episode, "observed", step(&seen));
                     }
                     add_interactions(&mut tally, &recorded, &scenes[t], at, &mut followed);
                 }
@@ -187,7 +190,7 @@ pub fn report(
         let sampled: Vec<Vec<Scene>> = (0..samples)
             .map(|sample| {
                 let draw = Draw::Sample { seed: SEED + episodes[0] as u64, sample };
-                rollout(world, &recorded, &recorded.actions, draw, only_frames)
+                rollout(world, &recorded, CONDITIONING, &recorded.actions, draw, only_frames)
             })
             .collect();
         add_best(&mut tally, &recorded, &sampled, first_episode);
@@ -240,6 +243,18 @@ impl At {
     fn phase(self) -> &'static str {
         if self.t < CONDITIONING { "observed" } else { "imagined" }
     }
+}
+
+/// How far moved objects are followed: in `phase`, while the frames since the start were imagined or observed.
+fn add_motion(tally: &mut Tally, episode: usize, phase: &str, motion: Motion) {
+    let Motion { moved, kept, error, still, way } = motion;
+    let mut ratio = |name: &str, numerator, denominator| {
+        tally.ratio(&format!("moved_object_{name}_{phase}"), episode, numerator, denominator);
+    };
+    ratio("px", error, kept as f64);
+    ratio("px_still", still, kept as f64);
+    ratio("way", way, still);
+    ratio("kept", kept as f64, moved as f64);
 }
 
 /// Each episode gets its neighbour's actions from the first imagined step on.

@@ -23,17 +23,17 @@ pub(crate) struct Layout {
 
 /// The parts of latent vectors `[..., Z]`, as views.
 #[derive(Debug)]
-pub(crate) struct Latents {
+pub struct Latents {
     /// Presence in [0, 1], `[..., 1]`.
-    pub(crate) pres: Tensor,
+    pub pres: Tensor,
     /// Depth, smaller is nearer, `[..., 1]`.
-    pub(crate) depth: Tensor,
+    pub depth: Tensor,
     /// `(s_x, s_y, t_x, t_y)`, `[..., 4]`.
-    pub(crate) place: Tensor,
+    pub place: Tensor,
     /// Appearance, `[..., what]`.
-    pub(crate) what: Tensor,
+    pub what: Tensor,
     /// Dynamics, `[..., dyna]`.
-    pub(crate) dyna: Tensor,
+    pub dyna: Tensor,
 }
 
 impl Layout {

@@ -18,6 +18,7 @@ mod surroundings;
 use tch::{Kind, Tensor};
 
 pub use self::{
+    latents::Latents,
     render::{Placed, Rendering},
     surroundings::Agent,
 };
@@ -25,7 +26,7 @@ pub use self::{
 use self::{
     discovery::{Discovered, Discovery},
     glimpse::GlimpseDecoder,
-    latents::{Layout, place, presence},
+    latents::{Layout, SHIFT, place, presence, shift},
     memory::ObjectMemory,
     propagation::{Propagated, Propagation},
     relation::gather_rows,
@@ -34,7 +35,7 @@ use self::{
 use super::mixture::Memory;
 use crate::{
     config::{AgentFeature, DiscoveryPrior, GatsbiConfig, IdRule, Tracking},
-    nn::{Path, spatial_transformer::iou},
+    nn::{Normal, Path, spatial_transformer::iou},
     noise::{Noise, PhiloxNoise},
 };
 
@@ -63,6 +64,22 @@ impl ObjectState {
             prior: self.prior.shallow_clone(),
             ids: self.ids.shallow_clone(),
             next_id: self.next_id.shallow_clone(),
+        }
+    }
+
+    /// The same objects, without gradients, with their boxes moved by `jolts [B, MAX, 2]`, in units of the image's half side.
+    #[must_use]
+    pub fn jolted(&self, jolts: &Tensor) -> Self {
+        let part = |from: i64, width: i64| self.z.narrow(-1, from, width);
+        let after = SHIFT + 2;
+        let rest = part(after, self.z.size()[2] - after);
+        let z = Tensor::cat(&[part(0, SHIFT), shift(&self.z) + jolts, rest], -1);
+        let detached = |memory: &Memory| Memory { h: memory.h.detach(), c: memory.c.detach() };
+        Self {
+            z: z.detach(),
+            post: detached(&self.post),
+            prior: detached(&self.prior),
+            ..self.shallow_clone()
         }
     }
 }
@@ -295,6 +312,20 @@ impl ObjectModule {
         self.discovery.posterior(&discovery::input(frame, mu_mix), &nothing, &noise, false).z
     }
 
+    /// The parts of latent vectors `z [..., Z]`.
+    pub fn latents(&self, z: &Tensor) -> Latents {
+        self.layout.split(z)
+    }
+
+    /// The prior that the dynamics latents of an imagined step were drawn from, `[B, MAX, dyna]`.
+    pub fn dynamics_prior(&self, before: &ObjectState, after: &ObjectState) -> Normal {
+        let memory = match self.agent_feature {
+            AgentFeature::Current => &before.prior,
+            AgentFeature::Next => &after.prior,
+        };
+        self.propagation.dynamics_prior(&memory.h)
+    }
+
     /// Where objects `z [B, N, Z]` are.
     pub fn placed(&self, z: &Tensor) -> Placed {
         render::placed(&self.decoder, z, self.layout)
@@ -474,6 +505,11 @@ impl ObjectStep {
             _ => live.ones_like(),
         };
         propagated.plus(&discovered.kl(&active, prior))
+    }
+
+    /// Posterior of the dynamics latents, `[B, MAX, dyna]`, of the objects in the order in which they were before.
+    pub fn dynamics(&self) -> &Normal {
+        &self.propagated.dyna
     }
 
     /// How unexpectedly the tracked objects moved: KL of their dynamics to the prior, each weighted by its

@@ -34,6 +34,8 @@ pub struct Placed {
     pub offset: Tensor,
     /// Mean colour of what is drawn, `[B, N, 3]` in [0, 1].
     pub colour: Tensor,
+    /// What is drawn in a box, premultiplied colours and alpha in [0, 1] before presence, `[B, N, 4, s, s]`.
+    pub drawn: Tensor,
 }
 
 /// Draws objects `z [B, N, Z]` into images of `side` pixels.
@@ -62,15 +64,16 @@ pub(crate) fn placed(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Pl
     let alpha = glimpses.select(2, 3); // [B, N, s, s]
     let line = pixel_centres(alpha.size()[3], &alpha);
     let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
-    let painted = glimpses.narrow(2, 0, 3) * alpha.unsqueeze(2);
-    let painted = painted.sum_dim_intlist([3i64, 4].as_slice(), false, Kind::Float);
+    let painted = glimpses.narrow(2, 0, 3) * alpha.unsqueeze(2); // [B, N, 3, s, s]
+    let colour = painted.sum_dim_intlist([3i64, 4].as_slice(), false, Kind::Float);
     let middle = |across: i64| {
         let along = alpha.sum_dim_intlist(across, false, Kind::Float);
         (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
     };
     let within = Tensor::stack(&[middle(2), middle(3)], -1);
     Placed {
-        colour: painted / total.unsqueeze(-1),
+        colour: colour / total.unsqueeze(-1),
+        drawn: Tensor::cat(&[painted, alpha.unsqueeze(2)], 2),
         presence: pres,
         centre: place.narrow(-1, 2, 2),
         offset: within * place.narrow(-1, 0, 2).detach(),
