@@ -39,7 +39,7 @@ const EVERY: i64 = 4;
 /// Frames for which it is imagined.
 pub const HORIZON: i64 = 15;
 
-/// Frames that no episode is long enough with.
+/// Frames that an episode must have more of.
 pub const SHORTEST: i64 = FORMING + HORIZON;
 
 /// What the model made of episodes, frame by frame: all that is needed to imagine their objects from any frame on.

@@ -254,13 +254,12 @@ fn add_scene(
             let weight = objects.catching.at(moment.step);
             if let Some(found) = found.filter(|_| weight > 0.0 && phase == Phase::Observed) {
                 let jolts = jolts(&before, moment, t, pixels(model));
-                let noise: &dyn Noise = &noise;
                 let caught = model.follow(
                     &before.objects.jolted(&jolts),
                     (&before.mixture, &state.mixture),
                     &seen.mixture,
                     (frame, &batch.actions[t]),
-                    noise,
+                    &noise,
                     &tracking,
                 );
                 let caught = model.objects().placed(&caught.z);
@@ -422,10 +421,14 @@ fn add_places(
     found: Option<&Placed>,
     step: u64,
 ) {
+    let centring = recipe.centring.at(step);
+    if centring == 0.0 && found.is_none() && believed.is_none() {
+        return;
+    }
     let pixels = pixels(model);
     let objects = model.objects().placed(&known.z);
     let squared = pixels.powi(2);
-    terms.add("centring", loss::centring(&objects) * squared, recipe.centring.at(step));
+    terms.add("centring", loss::centring(&objects) * squared, centring);
     if let Some(found) = found {
         add_following(terms, "following", (&objects, found), recipe.following.at(step), pixels);
     }

@@ -24,7 +24,7 @@ pub struct GatsbiState {
     pub mixture: MixtureState,
     /// Objects.
     pub objects: ObjectState,
-    /// Steps absorbed, `[B]` int64.
+    /// Steps that the mixture has absorbed, `[B]` int64.
     pub step: Tensor,
 }
 

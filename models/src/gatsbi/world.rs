@@ -20,6 +20,13 @@ use crate::{
 /// Standard deviation of the image likelihood (paper, all data sets).
 const SIGMA: f64 = 0.1;
 
+/// Magnitude of a mixture latent from which on a belief has drifted. Residual updates are sums over a session's frames: past
+/// the frames of a training sequence some latents leave the range they were trained in, and what drifts feeds on itself.
+const DRIFTED: f64 = 24.0;
+
+/// Largest magnitude of a latent that is carried on, for rollouts, which no frame brings back.
+const LATENT_BOUND: f64 = 4.0 * DRIFTED;
+
 /// Outputs that need the objects drawn.
 const DRAWN: [Output; 5] = [
     Output::Frame,
@@ -84,6 +91,19 @@ impl GatsbiWorld {
 
     fn scaled(&self, action: &Tensor) -> Tensor {
         (action - &self.offset) / &self.scale
+    }
+
+    /// The state with mixtures that have drifted begun anew: the next frame is the first that they see. Objects stay.
+    fn renewed(&self, state: GatsbiState) -> GatsbiState {
+        let GatsbiState { mixture, objects, step } = state;
+        let largest = |z: &Tensor| z.abs().amax([1i64, 2].as_slice(), false);
+        let drifted = largest(&mixture.z_mask).maximum(&largest(&mixture.z_comp)).gt(DRIFTED);
+        let fresh = self.model.initial_state(step.size()[0]);
+        GatsbiState {
+            mixture: mixture.replaced(&drifted, &fresh.mixture),
+            objects,
+            step: fresh.step.where_self(&drifted, &step),
+        }
     }
 
     fn scene(
@@ -190,11 +210,11 @@ impl WorldModel for GatsbiWorld {
                     tracking: self.tracking,
                     stops: GradientStops::default(),
                 };
-                self.model.observe(state, frame, &action, noise, how)
+                self.model.observe(self.renewed(state), frame, &action, noise, how)
             }
         };
         let scene = self.scene(&state, &step, frame, wanted);
-        (pack(&state).0, scene)
+        (pack(&bounded(state)).0, scene)
     }
 
     fn imagine(
@@ -208,8 +228,17 @@ impl WorldModel for GatsbiWorld {
         let state = unpack(state, &self.layout);
         let (state, step) = self.model.imagine(state, &self.scaled(action), noise, &self.tracking);
         let scene = self.scene(&state, &step, None, wanted);
-        (pack(&state).0, scene)
+        (pack(&bounded(state)).0, scene)
     }
+}
+
+/// The state with latents that further steps are sound with.
+fn bounded(mut state: GatsbiState) -> GatsbiState {
+    let GatsbiState { mixture, objects, .. } = &mut state;
+    for latents in [&mut mixture.z_mask, &mut mixture.z_comp, &mut objects.z] {
+        *latents = latents.clamp(-LATENT_BOUND, LATENT_BOUND);
+    }
+    state
 }
 
 /// Slots other than the agent's, renormalised where it covers them.

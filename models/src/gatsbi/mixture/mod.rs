@@ -41,6 +41,11 @@ impl Memory {
     pub fn shallow_clone(&self) -> Self {
         Self { h: self.h.shallow_clone(), c: self.c.shallow_clone() }
     }
+
+    /// `other` in the rows `[B, 1, 1]` that are true.
+    fn replaced(&self, rows: &Tensor, other: &Self) -> Self {
+        Self { h: other.h.where_self(rows, &self.h), c: other.c.where_self(rows, &self.c) }
+    }
 }
 
 /// The recurrent state of the mixture, before the next frame.
@@ -71,6 +76,20 @@ impl MixtureState {
             mask_prior: self.mask_prior.shallow_clone(),
             comp_post: self.comp_post.shallow_clone(),
             comp_prior: self.comp_prior.shallow_clone(),
+        }
+    }
+
+    /// `other` in the rows `[B]` that are true.
+    pub(crate) fn replaced(&self, rows: &Tensor, other: &Self) -> Self {
+        let rows = rows.view([-1, 1, 1]);
+        let memory = |own: &Memory, other: &Memory| own.replaced(&rows, other);
+        Self {
+            z_mask: other.z_mask.where_self(&rows, &self.z_mask),
+            z_comp: other.z_comp.where_self(&rows, &self.z_comp),
+            mask_post: memory(&self.mask_post, &other.mask_post),
+            mask_prior: memory(&self.mask_prior, &other.mask_prior),
+            comp_post: memory(&self.comp_post, &other.comp_post),
+            comp_prior: memory(&self.comp_prior, &other.comp_prior),
         }
     }
 }

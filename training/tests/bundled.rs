@@ -1,4 +1,4 @@
-//! The bundled checkpoint follows objects whose boxes lie beside them.
+//! The bundled checkpoint follows objects whose boxes lie beside them, and its beliefs stay sound.
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -10,8 +10,11 @@ use gatsbi_models::{
     gatsbi::{
         model::{GradientStops, Observing},
         objects::Discover,
+        world::GatsbiWorld,
     },
     noise::PhiloxNoise,
+    scene::{Output, Outputs},
+    world_model::WorldModel as _,
 };
 use gatsbi_training::clips::Clips;
 use tch::{Device, Kind, Tensor};
@@ -19,14 +22,50 @@ use tch::{Device, Kind, Tensor};
 /// How far boxes are moved, in pixels to the right and up: an object's side is five to seven.
 const JOLT: [f32; 2] = [3.0, -2.0];
 
+fn bundled() -> Checkpoint {
+    let file =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/checkpoints/push1-tiny.safetensors");
+    Checkpoint::load(&file, Device::Cpu).unwrap()
+}
+
+fn heldout() -> Clips {
+    let sample =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples/push1-heldout.parquet");
+    Clips::read(&Dataset::open(sample).unwrap(), 0..2).unwrap()
+}
+
+#[test]
+fn a_belief_of_hundreds_of_frames_is_as_good_as_one_of_forty() {
+    let world = GatsbiWorld::new(bundled());
+    let clips = heldout();
+    let length = clips.shortest();
+    let batch = clips.beginnings(0..2, length, Device::Cpu);
+    let rest = Tensor::from_slice(&world.spec().neutral_action());
+    let rest = rest.unsqueeze(0).expand([2, -1], true);
+    let noise = PhiloxNoise::mean(2, Device::Cpu);
+    let wanted = Outputs::from_iter([Output::Frame, Output::Latents]);
+    let mut state = world.initial_state(2);
+    let mut errors = Vec::new();
+    // There and back, so that each frame follows from the one before.
+    let there: Vec<i64> = (0..length - 1).collect();
+    let back: Vec<i64> = (1..length).rev().collect();
+    for t in there.iter().chain(&back).cycle().take(400) {
+        let frame = &batch.frames[*t as usize];
+        let (next, scene) = world.observe(&state, Some(frame), &rest, &noise, wanted);
+        state = next;
+        let largest = scene.latents.unwrap().abs().max().double_value(&[]);
+        assert!(largest < 100.0, "a latent is {largest} after {} frames", errors.len() + 1);
+        errors.push((scene.frame.unwrap() - frame).square().mean(Kind::Float).double_value(&[]));
+    }
+    let mean = |errors: &[f64]| errors.iter().sum::<f64>() / errors.len() as f64;
+    let (early, late) = (mean(&errors[..40]), mean(&errors[300..]));
+    assert!(late < 1.6 * early, "the squared error grew from {early} to {late}");
+}
+
 #[test]
 fn an_object_beside_its_box_is_caught_in_the_next_frame() {
     let _no_grad = tch::no_grad_guard();
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let checkpoint = root.join("models/checkpoints/push1-tiny.safetensors");
-    let model = Checkpoint::load(&checkpoint, Device::Cpu).unwrap().model;
-    let sample = Dataset::open(root.join("episodes/samples/push1-heldout.parquet")).unwrap();
-    let clips = Clips::read(&sample, 0..2).unwrap();
+    let (model, clips) = (bundled().model, heldout());
     let batch = clips.beginnings(0..2, 5, Device::Cpu);
     let (noise, tracking) = (PhiloxNoise::mean(2, Device::Cpu), model.config().tracking);
     let half_side = model.config().image_size as f32 / 2.0;
