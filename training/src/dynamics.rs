@@ -13,8 +13,8 @@ use gatsbi_models::{
     gatsbi::{
         loss,
         mixture::Memory,
-        model::{Gatsbi, GatsbiStep, GradientStops, Observing},
-        objects::{Agent, Discover, ObjectState},
+        model::{Gatsbi, GatsbiStep, Observing},
+        objects::{Agent, ObjectState, gather_rows},
     },
     nn::Normal,
     noise::{PhiloxNoise, philox4x32_10},
@@ -183,14 +183,7 @@ fn see(
     let (mut observed, mut imagined) = (Frames::default(), Frames::default());
     for t in 0..length {
         let frame = &batch.frames[t as usize];
-        let how = Observing {
-            train: false,
-            priors: false,
-            objects: true,
-            discover: Discover::All,
-            tracking,
-            stops: GradientStops::default(),
-        };
+        let how = Observing::serving(tracking);
         let (next, seen) = model.observe(state, frame, &batch.actions[t as usize], &noise, how);
         state = next;
         let objects = &state.objects;
@@ -284,8 +277,7 @@ impl Slots {
 
     /// A part `[B, N, D]` of the state, slot by slot.
     fn pick(&self, part: &Tensor) -> Tensor {
-        let order = self.order.unsqueeze(-1).expand([-1, -1, part.size()[2]], false);
-        part.gather(1, &order, false)
+        gather_rows(part, &self.order)
     }
 }
 
@@ -367,10 +359,7 @@ fn formed(
         let met = seen(&rows);
         // What was not there before is remembered as it was met.
         let same = state.ids.eq_tensor(&met.ids).logical_and(&met.ids.ge(0)).unsqueeze(-1);
-        let prior = Memory {
-            h: next.prior.h.where_self(&same, &met.prior.h),
-            c: next.prior.c.where_self(&same, &met.prior.c),
-        };
+        let prior = met.prior.replaced(&same, &next.prior);
         state = ObjectState { prior, ..met };
     }
     state

@@ -223,14 +223,7 @@ fn add_scene(
         }
         seeing = seeing.map(|believed| {
             let _no_grad = tch::no_grad_guard();
-            let how = Observing {
-                train: false,
-                priors: false,
-                objects: true,
-                discover: Discover::None,
-                tracking,
-                stops: GradientStops::default(),
-            };
+            let how = Observing { discover: Discover::None, ..Observing::serving(tracking) };
             model.observe(believed, frame, &batch.actions[t], &noise, how).0
         });
         let rendering = objects.map(|_| model.render(&state));

@@ -186,7 +186,6 @@ impl Trainer {
                     let objective = dynamics::objective(model, remembered, recipe, moment, device);
                     (recipe.batch, recipe.length.at(moment.step), objective)
                 } else {
-                    self.forget();
                     let length = self.recipe.length.at(moment.step);
                     let batch = self.batch(clips, moment.step, length as i64);
                     adam::select(&stores, |name| rate(name) > 0.0);
@@ -225,6 +224,10 @@ impl Trainer {
             let every = |steps: u64| steps > 0 && self.progress.step.is_multiple_of(steps);
             if every(self.recipe.save_every) || self.progress.step == end {
                 self.save()?;
+                if self.recipe.dynamics_alone(self.progress.step).is_none() {
+                    remembered = None;
+                    self.forget();
+                }
             }
             if every(self.recipe.picture_every) || self.progress.step == end {
                 self.picture(clips, &mut journal)?;
@@ -262,7 +265,7 @@ impl Trainer {
         Ok(remembered)
     }
 
-    /// Removes what is of no use any more.
+    /// Removes what no run that goes on from the saved state needs.
     fn forget(&self) {
         fs_err::remove_file(self.remembered_path()).ok();
     }

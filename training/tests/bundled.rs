@@ -7,11 +7,7 @@ use std::path::Path;
 use gatsbi_episodes::Dataset;
 use gatsbi_models::{
     checkpoint::Checkpoint,
-    gatsbi::{
-        model::{GradientStops, Observing},
-        objects::Discover,
-        world::GatsbiWorld,
-    },
+    gatsbi::{model::Observing, world::GatsbiWorld},
     noise::PhiloxNoise,
     scene::{Output, Outputs},
     world_model::WorldModel as _,
@@ -74,14 +70,7 @@ fn an_object_beside_its_box_is_caught_in_the_next_frame() {
     let (mut moved, mut left) = (0, Vec::new());
     for (frame, action) in batch.frames.iter().zip(&batch.actions) {
         let before = state.shallow_clone();
-        let how = Observing {
-            train: false,
-            priors: false,
-            objects: true,
-            discover: Discover::All,
-            tracking,
-            stops: GradientStops::default(),
-        };
+        let how = Observing::serving(tracking);
         let (after, seen) = model.observe(state, frame, action, &noise, how);
         state = after;
         let jolts = Tensor::from_slice(&JOLT.map(|pixels| pixels / half_side));

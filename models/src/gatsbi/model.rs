@@ -82,6 +82,20 @@ pub struct Observing {
     pub stops: GradientStops,
 }
 
+impl Observing {
+    /// As a server observes, without what is asked for besides: with objects, of which all rows look for new ones.
+    pub fn serving(tracking: Tracking) -> Self {
+        Self {
+            train: false,
+            priors: false,
+            objects: true,
+            discover: Discover::All,
+            tracking,
+            stops: GradientStops::default(),
+        }
+    }
+}
+
 /// What a step gives besides the state.
 #[derive(Debug)]
 pub struct GatsbiStep {

@@ -5,7 +5,7 @@ use tch::{Device, Kind, Tensor};
 use super::{
     loss::{gaussian_log_likelihood, mixture_kl},
     mixture::{Memory, MixtureState, MixtureStep},
-    model::{Gatsbi, GatsbiState, GatsbiStep, GradientStops, Observing},
+    model::{Gatsbi, GatsbiState, GatsbiStep, Observing},
     objects::{Discover, ObjectState, ObjectStep},
 };
 use crate::{
@@ -203,14 +203,8 @@ impl WorldModel for GatsbiWorld {
                     DiscoveryPolicy::EveryFrame => Discover::All,
                     DiscoveryPolicy::FirstFrame => Discover::Rows(state.first()),
                 };
-                let how = Observing {
-                    train: false,
-                    priors: wanted.contains(Output::Surprise),
-                    objects: true,
-                    discover,
-                    tracking: self.tracking,
-                    stops: GradientStops::default(),
-                };
+                let priors = wanted.contains(Output::Surprise);
+                let how = Observing { priors, discover, ..Observing::serving(self.tracking) };
                 self.model.observe(self.renewed(state), frame, &action, noise, how)
             }
         };

@@ -42,8 +42,9 @@ impl Memory {
         Self { h: self.h.shallow_clone(), c: self.c.shallow_clone() }
     }
 
-    /// `other` in the rows `[B, 1, 1]` that are true.
-    fn replaced(&self, rows: &Tensor, other: &Self) -> Self {
+    /// `other` where `rows`, which broadcasts to the memory, is true.
+    #[must_use]
+    pub fn replaced(&self, rows: &Tensor, other: &Self) -> Self {
         Self { h: other.h.where_self(rows, &self.h), c: other.c.where_self(rows, &self.c) }
     }
 }

@@ -19,6 +19,7 @@ use tch::{Kind, Tensor};
 
 pub use self::{
     latents::Latents,
+    relation::gather_rows,
     render::{Placed, Rendering},
     surroundings::Agent,
 };
@@ -29,7 +30,6 @@ use self::{
     latents::{Layout, SHIFT, place, presence, shift},
     memory::ObjectMemory,
     propagation::{Propagated, Propagation},
-    relation::gather_rows,
     surroundings::Surroundings,
 };
 use super::mixture::Memory;

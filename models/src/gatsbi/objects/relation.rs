@@ -141,7 +141,7 @@ fn pairs((receivers, senders): &(Tensor, Tensor)) -> Tensor {
 }
 
 /// `[B, N, D]` at the rows `[B, R]` of each sample.
-pub(super) fn gather_rows(x: &Tensor, rows: &Tensor) -> Tensor {
+pub fn gather_rows(x: &Tensor, rows: &Tensor) -> Tensor {
     let (batch, count) = rows.size2().expect("row numbers have two axes");
     x.gather(1, &rows.unsqueeze(-1).expand([batch, count, x.size()[2]], false), false)
 }
