@@ -38,6 +38,8 @@ pub struct Ablation<'a> {
     pub data: &'a str,
     /// Seed of each run.
     pub seed: u64,
+    /// Checkpoint whose weights each run starts from, as far as it has them.
+    pub from: Option<&'a Path>,
     /// Where they compute.
     pub device: Device,
     /// Data that they are measured on.
@@ -55,6 +57,9 @@ impl Ablation<'_> {
         let recipe = variant.of(self.recipe, self.steps)?;
         let mut trainer =
             Trainer::open(recipe, self.clips, self.data, self.seed, folder, self.device)?;
+        if let Some(from) = self.from {
+            trainer.start_from(from)?;
+        }
         trainer.run(self.clips, None)?;
         let world = GatsbiWorld::load(&trainer.checkpoint_path(), self.device)?;
         let protocol = Protocol { horizon: self.horizon, samples: 0, perceptual: None };

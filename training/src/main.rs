@@ -111,6 +111,9 @@ enum Command {
         /// Folder: a run per variant, and table.md.
         #[arg(long)]
         out: PathBuf,
+        /// Checkpoint whose weights every variant starts from, as far as it has them.
+        #[arg(long)]
+        from: Option<PathBuf>,
         /// Where to train: cpu, or cuda:N.
         #[arg(long, default_value = "cpu", value_parser = device)]
         device: Device,
@@ -181,7 +184,18 @@ fn main() -> anyhow::Result<()> {
             }
             trainer.run(&clips, None)?;
         }
-        Command::Ablate { recipe, variants, episodes, range, test, steps, seed, out, device } => {
+        Command::Ablate {
+            recipe,
+            variants,
+            episodes,
+            range,
+            test,
+            steps,
+            seed,
+            out,
+            from,
+            device,
+        } => {
             tch::set_num_threads(1);
             let recipe = Recipe::load(&recipe)?;
             let dataset = Dataset::open(&episodes)?;
@@ -200,6 +214,7 @@ fn main() -> anyhow::Result<()> {
                 clips: &clips,
                 data: &data,
                 seed,
+                from: from.as_deref(),
                 device,
                 test: (&dataset, test),
                 horizon: HORIZON,

@@ -8,10 +8,10 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use gatsbi_models::{
     checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
-    config::{GatsbiConfig, presets},
+    config::{GatsbiConfig, ObjectConfig, presets},
     gatsbi::{
         keypoint::KeypointLearning,
-        model::{GradientStops, Observing},
+        model::{Gatsbi, GradientStops, Observing},
         objects::Discover,
         world::GatsbiWorld,
     },
@@ -60,6 +60,10 @@ pub struct Trainer {
     learning_store: ParamStore,
     adam: Adam,
     progress: Progress,
+    /// What the run started from: it remembers what dynamics are learned from, as it sees with all that it has learned.
+    seeing: Option<Gatsbi>,
+    /// Names of the parameters that what the run started from has not.
+    untrained: Vec<String>,
 }
 
 impl Trainer {
@@ -127,28 +131,44 @@ impl Trainer {
             learning,
             learning_store,
             adam: Adam::default(),
+            seeing: None,
+            untrained: Vec::new(),
         };
         trainer.resume()?;
         Ok(trainer)
     }
 
-    /// Starts from the weights of a checkpoint of the same architecture, if the run has not begun.
+    /// Starts from the weights of a checkpoint, if the run has not begun. An architecture that differs from the checkpoint's
+    /// in how objects meet each other and the agent takes what both have; the rest starts untrained.
     ///
     /// # Errors
-    /// If the checkpoint cannot be read or has another architecture.
+    /// If the checkpoint cannot be read or its architecture differs in anything else.
     pub fn start_from(&mut self, path: &Path) -> anyhow::Result<()> {
-        if self.progress.step == 0 {
-            let loaded = Checkpoint::load(path, self.device)?;
-            let header = self.checkpoint.header.clone();
-            let mut theirs =
-                GatsbiConfig { tracking: header.model.tracking, ..loaded.header.model };
-            // None of these decides what parameters there are.
-            theirs.objects.agent_feature = header.model.objects.agent_feature;
-            theirs.objects.rejection = header.model.objects.rejection;
-            ensure!(theirs == header.model, "{} has another architecture", path.display());
-            self.checkpoint = Checkpoint { header, ..loaded };
-            self.recipe.prefit = None;
+        if self.progress.step > 0 {
+            return Ok(());
         }
+        let loaded = Checkpoint::load(path, self.device)?;
+        let ours = &self.checkpoint.header.model;
+        let theirs = GatsbiConfig {
+            objects: ObjectConfig {
+                // Neither decides what parameters there are.
+                agent_feature: ours.objects.agent_feature,
+                rejection: ours.objects.rejection,
+                // These do.
+                interaction: ours.objects.interaction,
+                graph: ours.objects.graph,
+                ..loaded.header.model.objects.clone()
+            },
+            tracking: ours.tracking,
+            ..loaded.header.model.clone()
+        };
+        ensure!(theirs == *ours, "{} has another architecture", path.display());
+        self.recipe.prefit = None;
+        let header = self.checkpoint.header.clone();
+        let header = Header { agent_slot: loaded.header.agent_slot, ..header };
+        self.checkpoint = Checkpoint::untrained(header, self.device);
+        self.untrained = self.checkpoint.store.take(&loaded.store);
+        self.seeing = Some(loaded.model);
         Ok(())
     }
 
@@ -166,6 +186,9 @@ impl Trainer {
         let mut journal = Journal::start(&self.folder, self.progress.step, self.recipe.steps)?;
         if self.progress.step == 0 {
             journal.say(&format!("differences up to {:.3} count as shadow", clips.shadow));
+            if !self.untrained.is_empty() {
+                journal.say(&format!("start untrained: {}", self.untrained.join(", ")));
+            }
             self.prefit(clips, &journal);
         }
         let mut skipped_in_a_row = 0;
@@ -173,15 +196,15 @@ impl Trainer {
         while self.progress.step < end {
             let started = Instant::now();
             let moment = self.moment();
+            if remembered.is_none() && self.recipe.dynamics_alone(moment.step).is_some() {
+                remembered = Some(self.remembered(clips, &journal)?);
+            }
             let stores = [&self.checkpoint.store, &self.learning_store];
             let rate = |name: &str| self.recipe.rate_of(name, moment.step);
             let (model, device) = (&self.checkpoint.model, self.device);
+            let dynamics = self.recipe.dynamics_alone(moment.step);
             let (rows, length, objective) =
-                if let Some(recipe) = self.recipe.dynamics_alone(moment.step) {
-                    let remembered = match &mut remembered {
-                        Some(remembered) => remembered,
-                        none => none.insert(self.remembered(clips, &journal)?),
-                    };
+                if let Some((recipe, remembered)) = dynamics.zip(remembered.as_ref()) {
                     adam::select(&stores, |name| rate(name) > 0.0);
                     let objective = dynamics::objective(model, remembered, recipe, moment, device);
                     (recipe.batch, recipe.length.at(moment.step), objective)
@@ -250,7 +273,7 @@ impl Trainer {
     }
 
     /// What the model made of the data before its dynamics learned; that a resumed run cannot see again.
-    fn remembered(&self, clips: &Clips, journal: &Journal) -> anyhow::Result<Remembered> {
+    fn remembered(&mut self, clips: &Clips, journal: &Journal) -> anyhow::Result<Remembered> {
         let path = self.remembered_path();
         if path.exists() {
             return Remembered::read(&path, clips);
@@ -260,7 +283,9 @@ impl Trainer {
                 journal.say(&format!("{seen} of {} episodes are remembered", clips.len()));
             }
         };
-        let remembered = Remembered::by(&self.checkpoint.model, clips, self.device, told);
+        let seeing = self.seeing.take();
+        let model = seeing.as_ref().unwrap_or(&self.checkpoint.model);
+        let remembered = Remembered::by(model, clips, self.device, told);
         remembered.write(&path)?;
         Ok(remembered)
     }

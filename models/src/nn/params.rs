@@ -60,6 +60,20 @@ impl ParamStore {
         self.trainable().map(|(_, tensor)| tensor.numel()).sum()
     }
 
+    /// Takes over the values of all parameters that `other` has under the same name in the same shape; returns the names
+    /// of the others.
+    pub fn take(&mut self, other: &Self) -> Vec<String> {
+        let _no_grad = tch::no_grad_guard();
+        let mut left = Vec::new();
+        for (name, (_, tensor)) in &mut self.entries {
+            match other.get(name).filter(|theirs| theirs.size() == tensor.size()) {
+                Some(theirs) => tensor.copy_(theirs),
+                None => left.push(name.clone()),
+            }
+        }
+        left
+    }
+
     /// Stops gradients for every parameter.
     pub fn stop_gradients(&mut self) {
         for (_, tensor) in self.entries.values_mut() {
