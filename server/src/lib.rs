@@ -10,6 +10,7 @@
 pub mod access;
 pub mod api;
 pub mod app;
+pub mod bounds;
 pub mod checkpoints;
 pub mod config;
 pub mod dashboard;

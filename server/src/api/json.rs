@@ -8,8 +8,9 @@ use std::sync::LazyLock;
 use gatsbi_proto::v1::FILE_DESCRIPTOR_SET;
 use prost::{Message, Name};
 use prost_reflect::{
-    DescriptorPool, DeserializeOptions, DynamicMessage, MessageDescriptor, SerializeOptions,
+    DescriptorPool, DeserializeOptions, DynamicMessage, MessageDescriptor, SerializeOptions, Value,
 };
+use serde_json::Value as Json;
 
 use crate::error::Error;
 
@@ -31,6 +32,12 @@ pub fn decode<M: Message + Name + Default>(text: &[u8]) -> Result<M, Error> {
     let message = DynamicMessage::deserialize_with_options(descriptor::<M>(), &mut json, &options)
         .map_err(|error| malformed(error.to_string()))?;
     json.end().map_err(|error| malformed(error.to_string()))?;
+    if holds_greatest(&message) {
+        let json = serde_json::from_slice(text).map_err(|error| malformed(error.to_string()))?;
+        if let Some(field) = rounded(&message, &json) {
+            return Err(malformed(format!("{field} is more than {}", u64::MAX)));
+        }
+    }
     message.transcode_to().map_err(|error| malformed(error.to_string()))
 }
 
@@ -48,6 +55,39 @@ pub fn encode<M: Message + Name>(message: &M) -> Vec<u8> {
         .serialize_with_options(&mut json, &options)
         .expect("messages have a JSON form, and memory can be written");
     text
+}
+
+/// Whether a number is the greatest that 64 bits hold, as greater ones become when they are read.
+fn holds_greatest(message: &DynamicMessage) -> bool {
+    let greatest = |value: &Value| match value {
+        Value::U64(number) => *number == u64::MAX,
+        Value::Message(message) => holds_greatest(message),
+        _ => false,
+    };
+    message.fields().any(|(_, value)| match value {
+        Value::List(values) => values.iter().any(greatest),
+        value => greatest(value),
+    })
+}
+
+/// The first field whose number is not what the text says, because it was greater than 64 bits hold.
+fn rounded(message: &DynamicMessage, text: &Json) -> Option<String> {
+    let wrong = |value: &Value, text: &Json, name: &str| match value {
+        Value::U64(u64::MAX) if text.is_f64() => Some(name.to_owned()),
+        Value::Message(message) => rounded(message, text).map(|inner| format!("{name}.{inner}")),
+        _ => None,
+    };
+    message.fields().find_map(|(field, value)| {
+        let text = text.get(field.name()).or_else(|| text.get(field.json_name()))?;
+        let name = field.name();
+        match value {
+            Value::List(values) => values
+                .iter()
+                .zip(text.as_array()?)
+                .find_map(|(value, text)| wrong(value, text, name)),
+            value => wrong(value, text, name),
+        }
+    })
 }
 
 fn descriptor<M: Name>() -> MessageDescriptor {
@@ -79,6 +119,23 @@ mod tests {
         assert_eq!(value["seed"], 1u64 << 52);
         assert_eq!(value["next_step"], 0);
         assert_eq!(decode::<v1::Session>(&encode(&session)).unwrap(), session);
+    }
+
+    #[test]
+    fn numbers_beyond_64_bits_are_refused() {
+        let read = |seed: &str| {
+            let text = format!(r#"{{"sampling": {{"seed": {seed}}}}}"#);
+            decode::<v1::ImagineRequest>(text.as_bytes())
+        };
+        for good in ["18446744073709551615", "\"18446744073709551615\"", "1e19"] {
+            assert!(read(good).is_ok(), "{good}");
+        }
+        for bad in ["18446744073709551616", "18446744073709552001", "1.8446744073709552e19", "2e19"]
+        {
+            assert!(matches!(read(bad), Err(Error::Malformed { .. })), "{bad}");
+        }
+        let reason = read("18446744073709551616").unwrap_err().to_string();
+        assert!(reason.ends_with("sampling.seed is more than 18446744073709551615"), "{reason}");
     }
 
     #[test]

@@ -4,6 +4,7 @@
 //! whose schemas come from [`schemas`], and what is made for people to look at. The document is checked in (`server/openapi.json`), so that every change of the API is seen.
 
 mod operations;
+mod requirements;
 mod schemas;
 mod showings;
 
@@ -45,7 +46,7 @@ fn document(files: &FileDescriptorSet) -> Json {
         path[showing.method] = showings::describe(showing);
     }
     let mut components = schemas.into_components();
-    components["Problem"] = problem();
+    components["ProblemDetails"] = problem();
     json!({
         "openapi": "3.1.0",
         "info": {
@@ -89,17 +90,23 @@ fn describe(operation: &Operation, schemas: &mut Schemas<'_>) -> Json {
             "default": problem_answer(),
         },
     });
-    let message = || reference(&rpc.input);
+    let message = || {
+        let mut message = reference(&rpc.input);
+        requirements::add(&mut message, requirements::body(operation.id));
+        message
+    };
     let content = match operation.body {
         Body::None => return described,
         Body::Message => json!({ JSON: { "schema": message() }, PROTOBUF: {} }),
         Body::Observation => json!({
             JSON: { "schema": message() },
             PROTOBUF: {},
-            "multipart/form-data": { "schema": form() },
+            "multipart/form-data": { "schema": requirements::form() },
         }),
         Body::Snapshot => json!({ JSON: { "schema": message() }, PROTOBUF: {}, OCTETS: {} }),
-        Body::Lines => json!({ LINES: { "schema": message() }, JSON: { "schema": message() } }),
+        Body::Lines => {
+            json!({ LINES: { "schema": lines(&message()) }, JSON: { "schema": message() } })
+        }
     };
     described["requestBody"] = json!({ "content": content });
     described
@@ -114,14 +121,33 @@ fn answer(operation: &Operation, output: &str) -> Json {
                 "type": "object",
                 "properties": { "chunks": { "type": "array", "items": chunk } },
             });
-            json!({ LINES: { "schema": message }, JSON: { "schema": whole } })
+            // What goes wrong on the way is the last line.
+            let line = json!({ "anyOf": [message, problem_line()] });
+            json!({ LINES: { "schema": lines(&line) }, JSON: { "schema": whole } })
         }
-        (_, Body::Lines) => json!({ LINES: { "schema": message } }),
+        (_, Body::Lines) => {
+            let line = json!({ "anyOf": [message, problem_line()] });
+            json!({ LINES: { "schema": lines(&line) } })
+        }
         ("ExportSession", _) => {
             json!({ JSON: { "schema": message }, PROTOBUF: {}, OCTETS: {} })
         }
         _ => json!({ JSON: { "schema": message }, PROTOBUF: {} }),
     }
+}
+
+/// Lines, as an array of what each of them is: so `OpenAPI` 3.2 reads schemas of sequential media types.
+fn lines(line: &Json) -> Json {
+    json!({ "type": "array", "items": line })
+}
+
+/// The last line of an answer that ends too early.
+fn problem_line() -> Json {
+    json!({
+        "type": "object",
+        "required": ["problem"],
+        "properties": { "problem": { "$ref": "#/components/schemas/ProblemDetails" } },
+    })
 }
 
 fn parameters(operation: &Operation) -> Vec<Json> {
@@ -141,7 +167,7 @@ fn path_parameters(path: &'static str) -> impl Iterator<Item = Json> {
 
 fn query_parameters(query: &[(&str, &str, &str)]) -> impl Iterator<Item = Json> {
     query.iter().map(|(name, kind, about)| {
-        let schema = json!({ "type": kind });
+        let schema = requirements::parameter(name, kind);
         json!({ "name": name, "in": "query", "description": about, "schema": schema })
     })
 }
@@ -149,28 +175,7 @@ fn query_parameters(query: &[(&str, &str, &str)]) -> impl Iterator<Item = Json> 
 fn problem_answer() -> Json {
     json!({
         "description": "What is wrong, in which field, and what was expected.",
-        "content": { PROBLEM: { "schema": { "$ref": "#/components/schemas/Problem" } } },
-    })
-}
-
-/// An observation as a form, for people with curl.
-fn form() -> Json {
-    let text = |about: &str| json!({ "type": "string", "description": about });
-    json!({
-        "type": "object",
-        "required": ["step"],
-        "properties": {
-            "step": text("Number of the step."),
-            "image": {
-                "type": "string",
-                "contentMediaType": "image/*",
-                "description": "A PNG, JPEG or WebP file.",
-            },
-            "action": text("Numbers separated by commas."),
-            "outputs": text("Names of outputs separated by commas, such as frame,objects."),
-            "encoding": text("Name of an encoding, such as png."),
-            "timeout_millis": text("Milliseconds within which an answer is of use."),
-        },
+        "content": { PROBLEM: { "schema": { "$ref": "#/components/schemas/ProblemDetails" } } },
     })
 }
 
@@ -238,6 +243,22 @@ mod tests {
         let missing: Vec<&String> = methods.difference(&described).collect();
         assert_eq!(missing, ["CloseHandles", "ObserveStream", "OpenHandles", "StepHandles"]);
         assert!(described.is_subset(&methods));
+    }
+
+    #[test]
+    fn every_oneof_and_every_required_field_is_one_of_the_messages() {
+        let components = DOCUMENT["components"]["schemas"].as_object().unwrap();
+        for (name, schema) in components {
+            let properties = schema["properties"].as_object();
+            for required in schema["required"].as_array().into_iter().flatten() {
+                assert!(properties.unwrap().contains_key(required.as_str().unwrap()), "{name}");
+            }
+            let (choices, needed) =
+                (schema["oneOf"].as_array(), requirements::needs_a_choice(name));
+            assert!(!needed || choices.is_some(), "{name}");
+        }
+        assert_eq!(components["Subject"]["oneOf"].as_array().unwrap().len(), 3);
+        assert_eq!(components["WarmStart"]["oneOf"].as_array().unwrap().len(), 3, "or nothing");
     }
 
     #[test]

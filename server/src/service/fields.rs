@@ -9,6 +9,7 @@ use gatsbi_models::{
 use gatsbi_proto::v1::{self, Encoding};
 
 use crate::{
+    bounds::ONE_OR_MORE,
     engine::commands::{Depths, Form, Wanted},
     error::{Error, FieldProblem},
 };
@@ -218,8 +219,10 @@ pub(super) fn deadline(
     call: Option<Instant>,
 ) -> Result<Option<Instant>, Error> {
     let own = match timeout_millis {
-        Some(0) => return Err(Error::invalid("timeout_millis", 0, "1 or more")),
-        Some(millis) => Some(Instant::now() + Duration::from_millis(millis.into())),
+        Some(millis) => {
+            let millis = ONE_OR_MORE.check(millis, "timeout_millis")?;
+            Some(Instant::now() + Duration::from_millis(millis.into()))
+        }
         None => None,
     };
     Ok(own.into_iter().chain(call).min())

@@ -14,6 +14,7 @@ use super::{
     programs,
 };
 use crate::{
+    bounds::ONE_OR_MORE,
     engine::commands::{Chunk, Depths, Form, Imagine, NumberType, Spent, Tenant, Urgency, Wanted},
     error::Error,
     planning::{
@@ -108,10 +109,8 @@ impl Service {
         let draws = self.draws(v1::Sampling { seed: drawn.then_some(seed), ..sampling })?;
         let at_step = position.last(request.at_step)?;
         let start = start_of(request.warm_start, &session, at_step, &space)?;
-        let budget = match request.budget_millis {
-            Some(0) => return Err(Error::invalid("budget_millis", 0, "1 or more")),
-            budget => budget,
-        };
+        let budget = request.budget_millis;
+        let budget = budget.map(|millis| ONE_OR_MORE.check(millis, "budget_millis")).transpose()?;
         let question = Question {
             program: &program,
             position: &position,

@@ -9,18 +9,16 @@ use gatsbi_proto::v1::{
 
 use super::goals::Goal;
 use crate::{
+    bounds::{
+        ITERATIONS, NOT_ALL, NOT_NEGATIVE, Numbers, ONE_OR_MORE, POSITIVE, SHARE, SOME, SPECTRUM,
+        TERMS,
+    },
     error::Error,
     planning::{
         cost::{Measure, Pixels, Program, Rect, Risk, Subject, Term, When},
         search::{Icem, Optimiser},
     },
 };
-
-/// Terms and constraints of a program, each.
-const MAX_TERMS: usize = 64;
-
-/// Iterations of a search.
-const MAX_ITERATIONS: u32 = 100;
 
 /// Finds the goal with an id.
 type FindGoal<'a> = &'a dyn Fn(&str) -> Result<Arc<Goal>, Error>;
@@ -36,10 +34,10 @@ pub(super) fn program(
 ) -> Result<Program, Error> {
     let asked = asked.ok_or_else(|| Error::invalid("costs", "absent", "a cost program"))?;
     let count = |field: &str, found: usize, least: usize| {
-        if (least..=MAX_TERMS).contains(&found) {
+        if (least..=TERMS).contains(&found) {
             return Ok(());
         }
-        Err(Error::invalid(field, format!("{found} entries"), format!("{least} to {MAX_TERMS}")))
+        Err(Error::invalid(field, format!("{found} entries"), format!("{least} to {TERMS}")))
     };
     count("costs.terms", asked.terms.len(), 1)?;
     count("costs.constraints", asked.constraints.len(), 0)?;
@@ -48,9 +46,7 @@ pub(super) fn program(
         Ok(v1::Risk::Worst) => Risk::Worst,
         Ok(v1::Risk::WorstShare) => {
             let share = asked.worst_share.unwrap_or(0.25);
-            Risk::WorstShare(within(share, "costs.worst_share", "more than 0, at most 1", |x| {
-                x > 0.0 && x <= 1.0
-            })?)
+            Risk::WorstShare(SOME.check(share, "costs.worst_share")?)
         }
         Err(_) => return Err(Error::invalid("costs.risk", asked.risk, "a known risk")),
     };
@@ -70,14 +66,10 @@ pub(super) fn program(
     Ok(Program {
         terms,
         constraints,
-        discount: within(
-            asked.discount.unwrap_or(1.0),
-            "costs.discount",
-            "more than 0, at most 1",
-            |x| x > 0.0 && x <= 1.0,
-        )?,
+        discount: SOME.check(asked.discount.unwrap_or(1.0), "costs.discount")?,
         risk,
-        missing: not_negative(asked.missing_distance.unwrap_or(2.0), "costs.missing_distance")?,
+        missing: NOT_NEGATIVE
+            .check(asked.missing_distance.unwrap_or(2.0), "costs.missing_distance")?,
     })
 }
 
@@ -110,7 +102,7 @@ fn term(
                     finite(target.x, &format!("{field}.target.x"))?,
                     finite(target.y, &format!("{field}.target.y"))?,
                 ],
-                tolerance: not_negative(asked.tolerance, &format!("{field}.tolerance"))?,
+                tolerance: NOT_NEGATIVE.check(asked.tolerance, &format!("{field}.tolerance"))?,
                 squared: squared(asked.distance, &format!("{field}.distance"))?,
             }
         }
@@ -119,7 +111,8 @@ fn term(
             Measure::Between {
                 a: subject(asked.a, &format!("{field}.a"), spec)?,
                 b: subject(asked.b, &format!("{field}.b"), spec)?,
-                distance: not_negative(asked.target_distance, &format!("{field}.target_distance"))?,
+                distance: NOT_NEGATIVE
+                    .check(asked.target_distance, &format!("{field}.target_distance"))?,
                 squared: squared(asked.distance, &format!("{field}.distance"))?,
             }
         }
@@ -319,10 +312,6 @@ fn finite(value: f32, field: &str) -> Result<f32, Error> {
     within(value, field, "a finite number", f32::is_finite)
 }
 
-fn not_negative(value: f32, field: &str) -> Result<f32, Error> {
-    within(value, field, "a finite number, 0 or more", |x| x.is_finite() && x >= 0.0)
-}
-
 /// An optimiser with at most `most` candidates.
 ///
 /// # Errors
@@ -336,32 +325,22 @@ pub(super) fn optimiser(asked: Option<WireOptimiser>, most: u32) -> Result<Optim
         }
         Err(Error::invalid(field, value, format!("{least} to {most}")))
     };
-    let number =
-        |value: Option<f32>, usual: f32, field: &str, expected: &str, holds: fn(f32) -> bool| {
-            within(value.unwrap_or(usual), field, expected, |x| x.is_finite() && holds(x))
-                .map(f64::from)
-        };
-    let spectrum = |value, usual, field: &str| {
-        number(value, usual, field, "0 to 10", |x| (0.0..=10.0).contains(&x))
+    let number = |value: Option<f32>, usual: f32, field: &str, bounds: Numbers| {
+        bounds.check(value.unwrap_or(usual), field).map(f64::from)
+    };
+    let iterations = |value: Option<u32>, usual: u32, field: &str| {
+        ITERATIONS.check(value.unwrap_or(usual), field).map(|value| value as usize)
     };
     let cem = |asked: v1::Cem, field: &str, icem: Option<Icem>| {
         let at = |name: &str| format!("{field}.{name}");
         let candidates = count(asked.candidates, 256, (2, most), &at("candidates"))?;
         Ok(Optimiser::Cem {
             candidates,
-            iterations: count(asked.iterations, 5, (1, MAX_ITERATIONS), &at("iterations"))?,
+            iterations: iterations(asked.iterations, 5, &at("iterations"))?,
             elites: count(asked.elites, 32, (1, candidates as u32 - 1), &at("elites"))?,
-            initial_std: number(asked.initial_std, 0.5, &at("initial_std"), "more than 0", |x| {
-                x > 0.0
-            })?,
-            min_std: number(asked.min_std, 0.05, &at("min_std"), "0 or more", |x| x >= 0.0)?,
-            momentum: number(
-                asked.momentum,
-                0.1,
-                &at("momentum"),
-                "0 or more, less than 1",
-                |x| (0.0..1.0).contains(&x),
-            )?,
+            initial_std: number(asked.initial_std, 0.5, &at("initial_std"), POSITIVE)?,
+            min_std: number(asked.min_std, 0.05, &at("min_std"), NOT_NEGATIVE)?,
+            momentum: number(asked.momentum, 0.1, &at("momentum"), NOT_ALL)?,
             icem,
         })
     };
@@ -372,22 +351,18 @@ pub(super) fn optimiser(asked: Option<WireOptimiser>, most: u32) -> Result<Optim
         WireOptimiser::Cem(asked) => cem(asked, "cem", None),
         WireOptimiser::Icem(asked) => {
             let icem = Icem {
-                beta: spectrum(asked.noise_beta, 2.0, "icem.noise_beta")?,
-                keep: number(asked.keep_elites, 0.3, "icem.keep_elites", "0 to 1", |x| {
-                    (0.0..=1.0).contains(&x)
-                })?,
-                decay: number(asked.decay, 1.25, "icem.decay", "1 or more", |x| x >= 1.0)?,
+                beta: number(asked.noise_beta, 2.0, "icem.noise_beta", SPECTRUM)?,
+                keep: number(asked.keep_elites, 0.3, "icem.keep_elites", SHARE)?,
+                decay: number(asked.decay, 1.25, "icem.decay", ONE_OR_MORE)?,
             };
             cem(asked.cem.unwrap_or_default(), "icem.cem", Some(icem))
         }
         WireOptimiser::Mppi(asked) => Ok(Optimiser::Mppi {
             candidates: count(asked.candidates, 256, (1, most), "mppi.candidates")?,
-            iterations: count(asked.iterations, 1, (1, MAX_ITERATIONS), "mppi.iterations")?,
-            temperature: number(asked.temperature, 0.5, "mppi.temperature", "more than 0", |x| {
-                x > 0.0
-            })?,
-            std: number(asked.noise_std, 0.5, "mppi.noise_std", "more than 0", |x| x > 0.0)?,
-            beta: spectrum(asked.noise_beta, 0.0, "mppi.noise_beta")?,
+            iterations: iterations(asked.iterations, 1, "mppi.iterations")?,
+            temperature: number(asked.temperature, 0.5, "mppi.temperature", POSITIVE)?,
+            std: number(asked.noise_std, 0.5, "mppi.noise_std", POSITIVE)?,
+            beta: number(asked.noise_beta, 0.0, "mppi.noise_beta", SPECTRUM)?,
         }),
     }
 }

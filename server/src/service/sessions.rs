@@ -9,6 +9,7 @@ use gatsbi_proto::v1;
 
 use super::{Service, fields};
 use crate::{
+    bounds::{FORKS, LABEL, PAGE_SIZE},
     error::Error,
     sessions::{
         registry::kept_bytes,
@@ -18,9 +19,6 @@ use crate::{
 
 /// More lanes than blocks have.
 const LANES: u64 = 1 << 12;
-
-/// Characters of a label.
-const LABEL: usize = 128;
 
 impl Service {
     /// Opens a session.
@@ -81,10 +79,7 @@ impl Service {
         &self,
         request: &v1::ListSessionsRequest,
     ) -> Result<v1::ListSessionsResponse, Error> {
-        let size = request.page_size.unwrap_or(100);
-        if !(1..=1000).contains(&size) {
-            return Err(Error::invalid("page_size", size, "1 to 1000"));
-        }
+        let size = PAGE_SIZE.check(request.page_size.unwrap_or(100), "page_size")?;
         let token = request.page_token.as_str();
         let after = if token.is_empty() { None } else { Some(token.parse::<SessionId>()) };
         let Ok(after) = after.transpose() else {
@@ -131,10 +126,7 @@ impl Service {
         if request.at_step.is_some() {
             position.last(request.at_step)?;
         }
-        let count = request.count.unwrap_or(1);
-        if !(1..=1000).contains(&count) {
-            return Err(Error::invalid("count", count, "1 to 1000"));
-        }
+        let count = FORKS.check(request.count.unwrap_or(1), "count")?;
         if let Some(seed) = request.seed {
             position.draws.seed = seed;
             history = history.drawing(position.draws);
@@ -194,7 +186,12 @@ impl Service {
         let (kept, most) = (kept_bytes(terms, position), self.kept.kept_bytes);
         let expected = format!("at most {most} bytes for all sessions together");
         fields::all(vec![
-            fields::unless(label <= LABEL, "label", format!("{label} characters"), "at most 128"),
+            fields::unless(
+                label <= LABEL,
+                "label",
+                format!("{label} characters"),
+                format!("at most {LABEL}"),
+            ),
             fields::unless(
                 kept <= most || terms.keep_steps == 0,
                 "keep_steps",

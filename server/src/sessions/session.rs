@@ -280,7 +280,7 @@ impl Session {
         }
         let History { positions, seen, last: newest } = &mut current.history;
         let oldest = positions.front().map(|position| position.next_step - 1);
-        let at = positions.iter().position(|position| position.next_step == to_step + 1);
+        let at = positions.iter().position(|kept| kept.next_step.checked_sub(1) == Some(to_step));
         let at = at.ok_or(Error::StepNotKept { to_step, oldest, last })?;
         if let Some(position) = positions.drain(at..).next() {
             current.position = position;

@@ -108,8 +108,10 @@ async fn a_rewound_session_sees_again_what_it_saw() {
     assert!(violation.description.contains("a step of 1 to 3"), "{}", violation.description);
     let status = rewind(&server, &session, None).await.unwrap_err();
     assert_eq!(status.code(), Code::InvalidArgument);
-    let status = rewind(&server, &session, Some(9)).await.unwrap_err();
-    assert_eq!(status.code(), Code::FailedPrecondition);
+    for never in [9, u64::MAX] {
+        let status = rewind(&server, &session, Some(never)).await.unwrap_err();
+        assert_eq!(status.code(), Code::FailedPrecondition, "{never}");
+    }
     assert_eq!(server.next_step(&session).await, 4, "none of this moved it");
     let forgetful = server.seasoned(4, 2).await;
     let status = rewind(&server, &forgetful, Some(0)).await.unwrap_err();

@@ -61,7 +61,7 @@ pub(super) const OPERATIONS: &[Operation] = &[
     creating("post", "/v1/sessions", (SESSIONS, "CreateSession"), Body::Message),
     Operation {
         query: &[
-            ("page_size", "integer", "Sessions of a page, 1 to 1000; 100 by default."),
+            ("page_size", "integer", "Sessions of a page; 100 by default."),
             ("page_token", "string", "`next_page_token` of the previous page."),
             ("label", "string", "Only sessions with this label."),
         ],

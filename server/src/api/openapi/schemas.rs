@@ -9,11 +9,13 @@ use prost_types::{
 };
 use serde_json::{Value as Json, json};
 
+use super::requirements::{self, add};
+
 /// The package whose messages are described.
 const PACKAGE: &str = ".gatsbi.v1.";
 
-/// What base64 looks like, for readers that do not know `contentEncoding`.
-const BASE64: &str = "^(?:[A-Za-z0-9+/]{4})*(?:[A-Za-z0-9+/]{2}==|[A-Za-z0-9+/]{3}=)?$";
+/// What base64 looks like, for readers that do not know `contentEncoding`; padding may be left out.
+const BASE64: &str = "^(?:[A-Za-z0-9+/]{4})*(?:[A-Za-z0-9+/]{2}={0,2}|[A-Za-z0-9+/]{3}=?)?$";
 
 /// Field numbers of descriptors, of which paths of comments consist.
 const MESSAGE: i32 = 4;
@@ -133,21 +135,33 @@ impl<'a> Schemas<'a> {
     }
 
     fn message(&self, at: usize, path: &[i32], message: &DescriptorProto) -> Json {
+        let required = requirements::required(message.name());
         let mut properties = serde_json::Map::new();
         for (field_at, field) in message.field.iter().enumerate() {
             let path = [path, &[FIELD_OR_VALUE, field_at as i32]].concat();
-            let mut schema = or_null(self::field(field));
+            let schema = self::field(field);
+            let mut schema =
+                if required.contains(&field.name()) { schema } else { or_null(schema) };
+            add(&mut schema, requirements::field(message.name(), field.name()));
             if let Some(comment) = self.comments.get(&(at, path)) {
                 schema["description"] = json!(comment);
             }
             properties.insert(field.name().to_owned(), schema);
         }
-        json!({
+        let mut schema = json!({
             "type": "object",
             "description": self.comments.get(&(at, path.to_vec())).map_or("", String::as_str),
             "properties": properties,
             "additionalProperties": false,
-        })
+        });
+        if !required.is_empty() {
+            schema["required"] = json!(required);
+        }
+        if let Some(choice) = choice(message) {
+            schema["oneOf"] = choice;
+        }
+        add(&mut schema, requirements::whole(message.name()));
+        schema
     }
 
     /// The files of the package.
@@ -157,18 +171,46 @@ impl<'a> Schemas<'a> {
     }
 }
 
+/// The members of a oneof, of which a message has one at most: the others are absent or null.
+fn choice(message: &DescriptorProto) -> Option<Json> {
+    let members: Vec<&FieldDescriptorProto> = message
+        .field
+        .iter()
+        .filter(|field| field.oneof_index.is_some() && !field.proto3_optional())
+        .collect();
+    if members.is_empty() {
+        return None;
+    }
+    let only = |chosen: Option<&str>| {
+        let null = members.iter().map(|member| (member.name(), json!({ "type": "null" })));
+        let mut properties: BTreeMap<&str, Json> = null.collect();
+        let Some(chosen) = chosen else { return json!({ "properties": properties }) };
+        properties.insert(chosen, json!({ "not": { "type": "null" } }));
+        json!({ "required": [chosen], "properties": properties })
+    };
+    let mut choices: Vec<Json> = members.iter().map(|member| only(Some(member.name()))).collect();
+    if !requirements::needs_a_choice(message.name()) {
+        choices.push(only(None));
+    }
+    Some(json!(choices))
+}
+
 /// The schema of a field.
 fn field(field: &FieldDescriptorProto) -> Json {
     let one = match field.r#type() {
         Type::Message | Type::Enum => reference(field.type_name()),
         Type::Double => json!({ "type": "number", "format": "double" }),
-        Type::Float => json!({ "type": "number", "format": "float" }),
-        Type::Int32 => json!({ "type": "integer", "format": "int32" }),
+        Type::Float => {
+            json!({ "type": "number", "format": "float", "minimum": f32::MIN, "maximum": f32::MAX })
+        }
+        Type::Int32 => {
+            json!({ "type": "integer", "format": "int32", "minimum": i32::MIN, "maximum": i32::MAX })
+        }
         Type::Uint32 => {
             json!({ "type": "integer", "format": "uint32", "minimum": 0, "maximum": u32::MAX })
         }
         Type::Uint64 => {
-            json!({ "type": "integer", "format": "uint64", "minimum": 0, "maximum": u64::MAX as f64 })
+            json!({ "type": "integer", "format": "uint64", "minimum": 0, "maximum": u64::MAX })
         }
         Type::Bool => json!({ "type": "boolean" }),
         Type::Bytes => {

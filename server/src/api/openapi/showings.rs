@@ -3,7 +3,8 @@
 use serde_json::{Value as Json, json};
 
 use super::{
-    JSON, PROTOBUF, path_parameters, problem_answer, query_parameters, schemas::reference,
+    JSON, PROTOBUF, path_parameters, problem_answer, query_parameters, requirements,
+    schemas::reference,
 };
 
 /// Feeds of server-sent events.
@@ -24,6 +25,8 @@ pub(super) struct Showing {
     answer: &'static str,
     /// Names, types and meanings of query parameters.
     query: &'static [(&'static str, &'static str, &'static str)],
+    /// Names of the events, if the answer is a feed.
+    events: &'static [&'static str],
     /// Whether the body says what is imagined.
     body: bool,
 }
@@ -38,7 +41,7 @@ const OF: Query = (
 const SCALE: Query = (
     "scale",
     "integer",
-    "Pixels of the picture for one of the model, 1 to 16; 4 by default, 2 for rollouts.",
+    "Pixels of the picture for one of the model; 4 by default, 2 for rollouts.",
 );
 const EVERY: Query = ("every", "integer", "Shows every k-th step only.");
 const OVERLAY: Query =
@@ -68,7 +71,17 @@ const fn picture(
     answer: &'static str,
     query: &'static [Query],
 ) -> Showing {
-    Showing { id, method: "get", path, summary, media: PNG, answer, query, body: false }
+    Showing {
+        id,
+        method: "get",
+        path,
+        summary,
+        media: PNG,
+        answer,
+        query,
+        events: &[],
+        body: false,
+    }
 }
 
 const STRIP: Showing = picture(
@@ -94,18 +107,15 @@ const FILM: Showing = Showing {
 pub(super) const SHOWINGS: &[Showing] = &[
     Showing {
         media: EVENTS,
+        events: &["overview"],
         ..picture(
             "WatchServer",
             "/v1/live",
             "Follows what the server does.",
             "Events `overview`: what the engine has computed since it started, what waits, and the sessions used last.",
             &[
-                (
-                    "every_millis",
-                    "integer",
-                    "Milliseconds between two events, 100 to 60000; 500 by default.",
-                ),
-                ("sessions", "integer", "Sessions to tell about, up to 1000; 60 by default."),
+                ("every_millis", "integer", "Milliseconds between two events; 500 by default."),
+                ("sessions", "integer", "Sessions to tell about; 60 by default."),
                 (
                     "thumbnails",
                     "boolean",
@@ -116,6 +126,7 @@ pub(super) const SHOWINGS: &[Showing] = &[
     },
     Showing {
         media: EVENTS,
+        events: &["belief", "closed"],
         ..picture(
             "WatchSession",
             "/v1/sessions/{id}/live",
@@ -169,10 +180,24 @@ pub(super) const SHOWINGS: &[Showing] = &[
     },
 ];
 
+/// One event of a feed: before 3.2, which tells events from their whole, readers of `OpenAPI` take the schema of a feed
+/// for that of an event. A feed whose key is withdrawn ends with a problem.
+fn event(names: &[&str]) -> Json {
+    let names = [names, &["problem"]].concat();
+    json!({
+        "type": "object",
+        "required": ["event", "data"],
+        "properties": {
+            "event": { "enum": names },
+            "data": { "type": "string", "contentMediaType": JSON },
+        },
+    })
+}
+
 /// A path as the document has it.
 pub(super) fn describe(showing: &Showing) -> Json {
     let schema = match showing.media {
-        EVENTS => json!({ "schema": { "type": "string" } }),
+        EVENTS => json!({ "schema": event(showing.events) }),
         media => json!({ "schema": { "type": "string", "contentMediaType": media } }),
     };
     let parameters: Vec<Json> =
@@ -188,7 +213,8 @@ pub(super) fn describe(showing: &Showing) -> Json {
         },
     });
     if showing.body {
-        let message = reference(".gatsbi.v1.ImagineRequest");
+        let mut message = reference(".gatsbi.v1.ImagineRequest");
+        requirements::add(&mut message, requirements::body(showing.id));
         described["requestBody"] =
             json!({ "content": { JSON: { "schema": message }, PROTOBUF: {} } });
     }

@@ -32,6 +32,7 @@ use tokio::time::{Interval, MissedTickBehavior, interval};
 use super::{App, answer};
 use crate::{
     api::counted,
+    bounds::{EVERY_MILLIS, OVERVIEW},
     engine::{Computed, Reading},
     error::Error,
     media,
@@ -46,13 +47,10 @@ use crate::{
     sessions::live::Shown,
 };
 
-/// Sessions that an overview tells about unless it is asked otherwise, and at most.
-const SESSIONS: usize = 60;
-const MAX_SESSIONS: usize = 1000;
-/// Milliseconds between two overviews.
-const EVERY: u64 = 500;
-const FASTEST: u64 = 100;
-const SLOWEST: u64 = 60_000;
+/// Sessions that an overview tells about unless it is asked otherwise.
+const SESSIONS: u32 = 60;
+/// Milliseconds between two overviews unless it is asked otherwise.
+const EVERY: u32 = 500;
 /// Thumbnails of one overview.
 const THUMBNAILS: usize = 24;
 
@@ -106,8 +104,8 @@ async fn session(
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Look {
-    every_millis: Option<u64>,
-    sessions: Option<usize>,
+    every_millis: Option<u32>,
+    sessions: Option<u32>,
     #[serde(default)]
     thumbnails: bool,
 }
@@ -129,15 +127,9 @@ async fn server(
     let start = answer("WatchServer", async {
         let Query(Look { every_millis, sessions, thumbnails }) =
             look.map_err(|error| malformed(&error))?;
-        let every = every_millis.unwrap_or(EVERY);
-        if !(FASTEST..=SLOWEST).contains(&every) {
-            return Err(Error::invalid("every_millis", every, format!("{FASTEST} to {SLOWEST}")));
-        }
-        let sessions = sessions.unwrap_or(SESSIONS);
-        if sessions > MAX_SESSIONS {
-            return Err(Error::invalid("sessions", sessions, format!("0 to {MAX_SESSIONS}")));
-        }
-        let mut ticks = interval(Duration::from_millis(every));
+        let every = EVERY_MILLIS.check(every_millis.unwrap_or(EVERY), "every_millis")?;
+        let sessions = OVERVIEW.check(sessions.unwrap_or(SESSIONS), "sessions")? as usize;
+        let mut ticks = interval(Duration::from_millis(every.into()));
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Feed { service, ticks, sessions, thumbnails, sent: BTreeMap::new() })
     });

@@ -18,6 +18,7 @@ use serde::Deserialize;
 use super::{App, answer, body::In, name_session};
 use crate::{
     api::call::Of as Called,
+    bounds::{ONE_OR_MORE, SCALE},
     error::Error,
     pictures::{
         self,
@@ -31,8 +32,6 @@ use crate::{
 const PNG: &str = "image/png";
 const GIF: &str = "image/gif";
 
-/// Greatest scale of a picture.
-const MAX_SCALE: u32 = 16;
 /// Pixels of a picture of a rollout.
 const MAX_PIXELS: u64 = 16 << 20;
 /// How long a depth of a film is shown where the model does not say.
@@ -273,6 +272,7 @@ async fn rollout(
     answer(method, async {
         let (mut request, look) = asked?;
         let scale = scale(look.scale, 2)?;
+        let every = ONE_OR_MORE.check(look.every.unwrap_or(1), "every")?;
         let position = service.session(&request.session_id)?.position();
         let spec = &position.model.spec;
         let outputs = match look.overlay {
@@ -290,7 +290,7 @@ async fn rollout(
             every_k: look.every,
             ..v1::OutputSelection::default()
         });
-        check_size(&request, look.every.unwrap_or(1), (scale * spec.image_size as u32).into())?;
+        check_size(&request, every, (scale * spec.image_size as u32).into())?;
         let mut rollout = service.imagine(request, call).await?;
         let mut pictures = Pictures::default();
         while let Some(chunk) = rollout.next().await {
@@ -306,7 +306,7 @@ fn check_size(request: &v1::ImagineRequest, every: u32, side: u64) -> Result<(),
     let shape = request.actions.as_ref().map_or(&[][..], |actions| &actions.shape);
     let rows = if let [candidates, _, _] = shape { u64::from(*candidates) } else { 1 };
     let horizon = shape.iter().rev().nth(1).copied().unwrap_or(1);
-    let pixels = rows * u64::from(horizon / every.max(1)) * side * side;
+    let pixels = rows * u64::from(horizon / every) * side * side;
     if pixels > MAX_PIXELS {
         let expected = format!("at most {MAX_PIXELS} pixels: fewer candidates, every, or scale");
         return Err(Error::invalid("actions", format!("{pixels} pixels"), expected));
@@ -327,11 +327,7 @@ fn read(look: Asked<Look>) -> Result<(Of, u32), Error> {
 }
 
 fn scale(asked: Option<u32>, default: u32) -> Result<u32, Error> {
-    let scale = asked.unwrap_or(default);
-    if (1..=MAX_SCALE).contains(&scale) {
-        return Ok(scale);
-    }
-    Err(Error::invalid("scale", scale, format!("1 to {MAX_SCALE}")))
+    SCALE.check(asked.unwrap_or(default), "scale")
 }
 
 fn malformed(rejection: &QueryRejection) -> Error {
