@@ -44,6 +44,15 @@ pub struct Tracking {
     /// `None` keeps both.
     #[serde(default)]
     pub merge: Option<f64>,
+    /// Distance between colours, in [0, 1] each, above which boxes are of different objects however much they overlap: they are
+    /// not merged, and what is found there is not rejected. `None` looks at boxes alone.
+    #[serde(default)]
+    pub unlike: Option<f64>,
+    /// How far from where it was an object keeps its identity when it is found anew, in units of the image's half side: if the
+    /// frame does not show its colour where it is thought to be, what is found in its colour is the same object, and where
+    /// nothing is it is kept in mind. `None` leaves identities to propagation. Needs `unlike`.
+    #[serde(default)]
+    pub handover: Option<f64>,
 }
 
 impl Tracking {
@@ -55,6 +64,8 @@ impl Tracking {
             ids: IdRule::Monotone,
             scale_bounds: Some((0.01, 1.5)),
             merge: None,
+            unlike: None,
+            handover: None,
         }
     }
 
@@ -66,6 +77,8 @@ impl Tracking {
             ids: IdRule::Original,
             scale_bounds: None,
             merge: None,
+            unlike: None,
+            handover: None,
         }
     }
 }
@@ -456,7 +469,7 @@ impl GatsbiConfig {
                 problems.push(problem.to_owned());
             }
         };
-        let Self { image_size, action, mixture, detector, objects, .. } = self;
+        let Self { image_size, action, mixture, detector, objects, tracking } = self;
         let image = *image_size;
         let sane = |sizes: &[i64]| sizes.iter().all(|size| (1..=8192).contains(size));
         let divides = |channels: &[i64], groups: &[i64]| {
@@ -568,6 +581,13 @@ impl GatsbiConfig {
                 check(sane(&[outputs]), "objects.interaction.outputs must be positive");
             }
         }
+        let positive = |value: Option<f64>| value.is_none_or(|value| value > 0.0);
+        check(
+            positive(tracking.unlike)
+                && positive(tracking.handover)
+                && (tracking.handover.is_none() || tracking.unlike.is_some()),
+            "tracking.unlike and tracking.handover must be positive, and handover needs unlike",
+        );
         problems
     }
 }
@@ -592,8 +612,10 @@ mod tests {
         config.objects.grid = 3;
         config.mixture.encoder.groups = vec![3, 4, 6];
         config.mixture.slots = 1;
+        config.tracking.handover = Some(0.5);
         let problems = config.problems().join("; ");
-        for word in ["mixture.slots", "mixture.encoder", "objects.image_encoder"] {
+        let words = ["mixture.slots", "mixture.encoder", "objects.image_encoder", "handover"];
+        for word in words {
             assert!(problems.contains(word), "{problems}");
         }
     }

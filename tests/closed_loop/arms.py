@@ -14,7 +14,7 @@ import numpy as np
 from gatsbi_client import Cem, Client, Icem as ServiceIcem, Session, costs
 from gatsbi_sim import Observation, Simulator
 
-from goals import LOST, SIZE, Goal, Table, in_image, unready
+from goals import CLICK, LOST, SIZE, Goal, Table, in_image, unready
 from search import Array, Budget, Icem
 
 REACH = 0.06
@@ -151,6 +151,7 @@ class Model(_Searching):
         self._session = self._client.create_session()
         self._at = in_image(seen.state["objects"][goal.named]["pixel"])
         self._id: int | None = None
+        self._met = False
         return self.look(seen, None)
 
     def look(self, seen: Observation, action: list[float] | None) -> dict[str, Any]:
@@ -160,8 +161,8 @@ class Model(_Searching):
         found = self._id in present
         if not found and present:
             near = min(present, key=lambda each: float(np.linalg.norm(present[each] - self._at)))
-            if np.linalg.norm(present[near] - self._at) < LOST:
-                self._id, found = near, True
+            if np.linalg.norm(present[near] - self._at) < (LOST if self._met else CLICK):
+                self._id, self._met, found = near, True, True
         if all(each.id != self._id for each in self._belief.objects):
             self._id = None
         if found and self._id is not None:

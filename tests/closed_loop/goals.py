@@ -22,8 +22,10 @@ TRIES = 1000
 """In vain, after which a goal without room is taken."""
 AROUND = 0.09
 """Distance at which the hand goes around an object, metres."""
+CLICK = 0.15
+"""A box this near to a click is meant by it; half the picture's side is 1."""
 LOST = 0.25
-"""An object that was seen more than this far from where it was before is another one; half the picture's side is 1."""
+"""An object that was seen more than this far from where it was before is another one."""
 SUCCESS = 0.03
 """An object this near to its target is there; metres."""
 

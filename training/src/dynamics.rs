@@ -301,6 +301,7 @@ pub fn objective(
     let (start, future) = sequences(remembered, recipe.batch, moment);
     let (start, future) = (start.to_device(device), future.to_device(device));
     let mut state = formed(model, remembered, &start, &mean);
+    let sure_at_first = remembered.get(part::SURE, &start);
     let mut terms = Terms::default();
     for k in 1..=recipe.length.at(step) as i64 {
         let (mu_mix, agent) = remembered.surroundings(part::IMAGINED, &(&future + k - 1));
@@ -311,7 +312,7 @@ pub fn objective(
         let same = state.ids.eq_tensor(&ids).logical_and(&ids.ge(0)).to_kind(Kind::Float);
         let (imagined, seen) = (objects.latents(&next.z), objects.latents(&z));
         let both = (&seen.pres * imagined.pres.detach()).squeeze_dim(-1);
-        let known = both * sure * same; // [B, N]
+        let known = both * &sure_at_first * sure * same; // [B, N]
         let mut add = |name, value: Tensor, weight: &Ramp| {
             let sum = (value * &known).sum_dim_intlist(-1, false, Kind::Float);
             terms.add(name, sum, weight.at(step));

@@ -75,6 +75,8 @@ pub fn training_tracking(objects: Option<&ObjectRecipe>) -> Tracking {
         ids: IdRule::Monotone,
         scale_bounds: objects.and_then(|objects| objects.scale_bounds),
         merge: objects.and_then(|objects| objects.merge),
+        unlike: objects.and_then(|objects| objects.unlike),
+        handover: None,
     }
 }
 
@@ -223,7 +225,7 @@ fn add_scene(
         }
         seeing = seeing.map(|believed| {
             let _no_grad = tch::no_grad_guard();
-            let how = Observing { discover: Discover::None, ..Observing::serving(tracking) };
+            let how = Observing::serving(model.config().tracking);
             model.observe(believed, frame, &batch.actions[t], &noise, how).0
         });
         let rendering = objects.map(|_| model.render(&state));

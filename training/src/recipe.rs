@@ -249,6 +249,11 @@ pub struct ObjectRecipe {
     pub scale_bounds: Option<(f64, f64)>,
     /// Overlap above which two boxes are one object ([`gatsbi_models::config::Tracking::merge`]).
     pub merge: Option<f64>,
+    /// Difference of colours above which they are two ([`gatsbi_models::config::Tracking::unlike`]).
+    pub unlike: Option<f64>,
+    /// How far served objects keep their identities when they are found anew
+    /// ([`gatsbi_models::config::Tracking::handover`]).
+    pub handover: Option<f64>,
     /// Standard deviation of both likelihoods below.
     pub sigma: f64,
     /// Weight of the Gaussian likelihood of the composite image.

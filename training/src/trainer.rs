@@ -100,6 +100,8 @@ impl Trainer {
             let tracking = &mut model.tracking;
             tracking.scale_bounds = objects.scale_bounds.or(tracking.scale_bounds);
             tracking.merge = objects.merge;
+            tracking.unlike = objects.unlike;
+            tracking.handover = objects.handover;
         }
         let mut header = untrained::header(&recipe.name, model, clips.actions.clone(), seed);
         header.frame_period = Some(clips.frame_period);

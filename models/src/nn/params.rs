@@ -269,6 +269,26 @@ mod tests {
     }
 
     #[test]
+    fn what_another_store_has_in_the_same_shape_is_taken_over() {
+        let store = |seed: u64, entries: &[(&str, [i64; 2])]| {
+            let mut store = ParamStore::new(seed, Device::Cpu);
+            store.build(|root| {
+                for (name, shape) in entries {
+                    let _ = root.weight(name, shape, Init::HeNormal);
+                }
+            });
+            store
+        };
+        let mut ours = store(1, &[("a", [4, 3]), ("b", [4, 3]), ("c", [2, 2])]);
+        let theirs = store(2, &[("a", [4, 3]), ("b", [3, 3]), ("d", [2, 2])]);
+        let kept = ours.get("b").unwrap().copy();
+        assert_eq!(ours.take(&theirs), ["b", "c"]);
+        assert_eq!(ours.get("a"), theirs.get("a"));
+        assert_eq!(ours.get("b"), Some(&kept));
+        assert!(ours.get("a").unwrap().requires_grad());
+    }
+
+    #[test]
     fn orthogonal_is_orthogonal_both_ways() {
         for shape in [[8, 3], [3, 8]] {
             let matrix = initial(&shape, Init::Orthogonal { gain: 2.0 }, 5);

@@ -29,13 +29,12 @@ pub(crate) struct Discovery {
     layout: Layout,
     grid: i64,
     map_sigma: f64,
-    rejection: Option<f64>,
 }
 
 /// Candidates of one frame, G² per row in row-major order of the cells.
 #[derive(Debug)]
 pub(crate) struct Discovered {
-    /// Latents after rejection, `[B, G², Z]`.
+    /// Latents; those that were rejected are absent, `[B, G², Z]`.
     pub(crate) z: Tensor,
     /// Posteriors of the cells.
     pub(crate) posterior: CellPosterior,
@@ -81,7 +80,6 @@ impl Discovery {
             layout,
             grid: config.grid,
             map_sigma: config.updates.map_sigma,
-            rejection: config.rejection,
         }
     }
 
@@ -101,12 +99,8 @@ impl Discovery {
         let uniform = noise.uniform(Site::DiscoveryPresence, &posterior.presence.size());
         let presence = relaxed_bernoulli(&posterior.presence, &uniform, 1.0);
         let place = self.absolute(&draw(&posterior.raw_place, Site::DiscoveryWhere));
-        let kept = match self.rejection {
-            Some(threshold) => presence.masked_fill(&rejected(&place, propagated, threshold), 0.0),
-            None => presence.shallow_clone(),
-        };
         let latents = Latents {
-            pres: kept,
+            pres: presence.shallow_clone(),
             depth: draw(&posterior.depth, Site::DiscoveryDepth),
             place,
             what: draw(&posterior.what, Site::DiscoveryWhat),
@@ -172,12 +166,11 @@ pub(crate) fn input(frame: &Tensor, mu_mix: &Tensor) -> Tensor {
     Tensor::cat(&[frame, &(frame - mu_mix)], 1)
 }
 
-/// Candidates at `z_where [B, G², 4]` that overlap a present propagated object more than `threshold`,
-/// `[B, G², 1]` bool.
-pub(crate) fn rejected(z_where: &Tensor, propagated: &Tensor, threshold: f64) -> Tensor {
-    let overlap = iou(&z_where.detach(), &place(propagated).detach()); // [B, G², N]
-    let present = presence(propagated).gt(0.5).transpose(1, 2); // [B, 1, N]
-    overlap.gt(threshold).logical_and(&present).any_dim(-1, true)
+/// Which known objects are present and overlap a candidate at `z_where [B, G², 4]` more than `threshold`, `[B, G², N]` bool.
+pub(crate) fn overlapped(z_where: &Tensor, known: &Tensor, threshold: f64) -> Tensor {
+    let overlap = iou(&z_where.detach(), &place(known).detach());
+    let present = presence(known).gt(0.5).transpose(1, 2); // [B, 1, N]
+    overlap.gt(threshold).logical_and(&present)
 }
 
 impl Discovered {

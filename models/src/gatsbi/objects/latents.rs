@@ -12,6 +12,9 @@ use crate::{
 /// Column of the first shift (t_x) in `z`.
 pub(super) const SHIFT: i64 = 4;
 
+/// Where appearance begins in a latent vector, after presence, depth and place.
+const WHAT: i64 = 6;
+
 /// Columns of a latent vector.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layout {
@@ -39,7 +42,7 @@ pub struct Latents {
 impl Layout {
     /// Width Z of a latent vector.
     pub(crate) fn width(self) -> i64 {
-        6 + self.what + self.dyna
+        WHAT + self.what + self.dyna
     }
 
     /// The parts of `z`.
@@ -48,8 +51,8 @@ impl Layout {
             pres: z.narrow(-1, 0, 1),
             depth: z.narrow(-1, 1, 1),
             place: place(z),
-            what: z.narrow(-1, 6, self.what),
-            dyna: z.narrow(-1, 6 + self.what, self.dyna),
+            what: z.narrow(-1, WHAT, self.what),
+            dyna: z.narrow(-1, WHAT + self.what, self.dyna),
         }
     }
 }
@@ -64,6 +67,17 @@ impl Latents {
 /// Presence of latent vectors, `[..., 1]`.
 pub(crate) fn presence(z: &Tensor) -> Tensor {
     z.narrow(-1, 0, 1)
+}
+
+/// Latent vectors `z [B, N, Z]` with other presences `[B, N, 1]`.
+pub(crate) fn with_presence(z: &Tensor, pres: &Tensor) -> Tensor {
+    Tensor::cat(&[pres, &z.narrow(-1, 1, z.size()[2] - 1)], -1)
+}
+
+/// Latent vectors `z [..., Z]` that look, and move, as those in `other`.
+pub(crate) fn looking_like(z: &Tensor, other: &Tensor) -> Tensor {
+    let rest = other.size()[other.dim() - 1] - WHAT;
+    Tensor::cat(&[z.narrow(-1, 0, WHAT), other.narrow(-1, WHAT, rest)], -1)
 }
 
 /// `z_where` of latent vectors, `[..., 4]`.

@@ -5,6 +5,7 @@
 
 mod discovery;
 mod glimpse;
+mod handover;
 mod image_encoder;
 mod latents;
 mod memory;
@@ -27,6 +28,7 @@ pub use self::{
 use self::{
     discovery::{Discovered, Discovery},
     glimpse::GlimpseDecoder,
+    handover::{Known, absent, squared},
     latents::{Layout, SHIFT, place, presence, shift},
     memory::ObjectMemory,
     propagation::{Propagated, Propagation},
@@ -166,6 +168,7 @@ pub struct ObjectModule {
     decoder: GlimpseDecoder,
     layout: Layout,
     agent_feature: AgentFeature,
+    rejection: Option<f64>,
     max_objects: i64,
     image_size: i64,
 }
@@ -185,6 +188,7 @@ impl ObjectModule {
             decoder: GlimpseDecoder::new(&path.sub("glimpse_decoder"), objects),
             layout,
             agent_feature: objects.agent_feature,
+            rejection: objects.rejection,
             max_objects: objects.max_objects,
             image_size: config.image_size,
         }
@@ -220,7 +224,7 @@ impl ObjectModule {
         let track = |[post, prior]: [&Memory; 2]| {
             self.propagation.posterior(&state.z, &post.h, &prior.h, scenery.frame, noise, tracking)
         };
-        let (propagated, [post, prior]) = match self.agent_feature {
+        let (mut propagated, [post, prior]) = match self.agent_feature {
             AgentFeature::Current => {
                 let propagated = track(memories);
                 let memories = self.remember(&propagated.z, memories, scenery, None);
@@ -231,10 +235,12 @@ impl ObjectModule {
                 (track(memories.each_ref()), memories)
             }
         };
-        let discovered = (!matches!(discover, Discover::None)).then(|| {
-            let input = discovery::input(scenery.frame, scenery.residual_mix);
-            self.discovery.posterior(&input, &propagated.z, noise, train)
-        });
+        if tracking.handover.is_some() {
+            // What is gone is kept in mind as it was.
+            propagated.z = state.z.where_self(&presence(&state.z).le(0.5), &propagated.z);
+        }
+        let discovered = (!matches!(discover, Discover::None))
+            .then(|| self.discover(&mut propagated, state, scenery, noise, tracking, train));
         let tracked = Tracked { post, prior };
         let (next, proposal) = match &discovered {
             None => keep_present(state, &tracked, &propagated),
@@ -243,7 +249,13 @@ impl ObjectModule {
             }
         };
         let next = match tracking.merge {
-            Some(threshold) => merged(next, threshold),
+            Some(threshold) => {
+                let unlike = tracking.unlike.map(|unlike| {
+                    let own = self.placed(&next.z).colour;
+                    squared(&own.unsqueeze(2), &own.unsqueeze(1)).gt(unlike.powi(2))
+                });
+                merged(next, threshold, unlike.as_ref())
+            }
             None => next,
         };
         (next, ObjectStep { proposal, propagated, discovered, discover })
@@ -376,6 +388,55 @@ impl ObjectModule {
         ]
     }
 
+    /// New objects of a frame. With [`Tracking::handover`] known ones that are lost become what is found of them.
+    fn discover(
+        &self,
+        propagated: &mut Propagated,
+        state: &ObjectState,
+        scenery: &Scenery<'_>,
+        noise: &dyn Noise,
+        tracking: &Tracking,
+        train: bool,
+    ) -> Discovered {
+        let (z, frame) = (propagated.z.shallow_clone(), scenery.frame);
+        let own = tracking.unlike.map(|unlike| (self.placed(&state.z).colour, unlike));
+        let known = own.as_ref().map(|(own, unlike)| Known {
+            z: &z,
+            ids: &state.ids,
+            own,
+            frame,
+            unlike: *unlike,
+        });
+        let handover = known.as_ref().zip(tracking.handover);
+        let handover = handover.map(|(known, reach)| (known, known.lost(), reach));
+        let seen =
+            handover.as_ref().map_or_else(|| z.shallow_clone(), |(_, lost, _)| absent(&z, lost));
+        let input = match &handover {
+            // What is known is explained, so that what is beside it shows as if it were alone.
+            Some(_) => {
+                let alpha = self.render(&seen).alpha;
+                let rest = frame + (scenery.residual_mix - frame) * alpha;
+                discovery::input(&rest, scenery.residual_mix)
+            }
+            None => discovery::input(frame, scenery.residual_mix),
+        };
+        let mut found = self.discovery.posterior(&input, &seen, noise, train);
+        if let Some(threshold) = self.rejection {
+            let same = discovery::overlapped(&found.place(), &seen, threshold);
+            let same = match &known {
+                Some(known) => same.logical_and(&known.alike(&found.z)),
+                None => same,
+            };
+            found.z = absent(&found.z, &same.any_dim(-1, false));
+        }
+        if let Some((known, lost, reach)) = handover {
+            let nothing = known.nothing_at(&found.z, scenery.residual_mix);
+            found.z = absent(&found.z, &nothing);
+            (propagated.z, found.z) = known.recognised(&found.z, &lost, &state.z, reach);
+        }
+        found
+    }
+
     /// Keeps the MAX most present of candidates and propagated objects (object spec 3.6).
     #[expect(clippy::too_many_arguments, reason = "the two sets and what is known of them")]
     fn select(
@@ -394,6 +455,11 @@ impl ObjectModule {
                 presence(&candidates.z).masked_fill(&rows.logical_not().view([-1, 1, 1]), -1.0)
             }
             _ => presence(&candidates.z),
+        };
+        let key = match tracking.handover {
+            // What is absent does not take the place of what is kept in mind.
+            Some(_) => key.masked_fill(&key.le(0.5), -1.0),
+            None => key,
         };
         let keys = Tensor::cat(&[key, presence(&propagated.z)], 1).squeeze_dim(-1);
         let (_, order) = keys.sort_stable(true, 1, true);
@@ -462,15 +528,18 @@ fn keep_present(
 }
 
 /// Takes the presence from boxes that overlap a present one of an earlier identity by more than `threshold`.
-fn merged(state: ObjectState, threshold: f64) -> ObjectState {
+/// Those that are `unlike [B, MAX, MAX]` stay.
+fn merged(state: ObjectState, threshold: f64, unlike: Option<&Tensor>) -> ObjectState {
     let boxes = place(&state.z).detach();
     let overlap = iou(&boxes, &boxes).gt(threshold); // [B, MAX, MAX]
+    let overlap = match unlike {
+        Some(unlike) => overlap.logical_and(&unlike.logical_not()),
+        None => overlap,
+    };
     let earlier = state.ids.unsqueeze(1).less_tensor(&state.ids.unsqueeze(2)); // [b, i, j]: j is known longer than i
     let present = presence(&state.z).gt(0.5).transpose(1, 2); // [B, 1, MAX]
-    let again = overlap.logical_and(&earlier).logical_and(&present).any_dim(-1, true);
-    let pres = presence(&state.z).masked_fill(&again, 0.0);
-    let rest = state.z.narrow(-1, 1, state.z.size()[2] - 1);
-    ObjectState { z: Tensor::cat(&[pres, rest], -1), ..state }
+    let again = overlap.logical_and(&earlier).logical_and(&present).any_dim(-1, false);
+    ObjectState { z: absent(&state.z, &again), ..state }
 }
 
 /// New objects are numbered in slot order from the session's counter.

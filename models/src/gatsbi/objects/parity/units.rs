@@ -7,7 +7,7 @@ use tch::{Kind, Tensor};
 use super::{
     super::{
         ObjectModule,
-        discovery::rejected,
+        discovery::overlapped,
         latents::{Latents, Layout, place as place_of},
         render::render,
     },
@@ -176,7 +176,8 @@ impl Units {
         );
         for threshold in [0.8, 0.3] {
             let presence = self.get("rejection.z_pres_disc");
-            let kept = presence.masked_fill(&rejected(boxes("disc"), &known, threshold), 0.0);
+            let kept = presence
+                .masked_fill(&overlapped(boxes("disc"), &known, threshold).any_dim(-1, true), 0.0);
             let expected = self.get(&format!("rejection.z_pres_out_thr{threshold}"));
             checker.compare("rejection", &kept, expected, Quantity::Value);
         }
