@@ -1,11 +1,11 @@
-//! The sample in the repository opens, is whole and holds what its README says.
+//! The samples in the repository open, are whole and hold what their README says.
 
 use std::path::Path;
 
 use gatsbi_episodes::{Dataset, LabelLegend};
 
 #[test]
-fn the_committed_sample_is_what_its_readme_says() {
+fn the_sample_of_push1_is_what_its_readme_says() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/push1-heldout.parquet");
     let dataset = Dataset::open(path).unwrap();
     let info = dataset.info();
@@ -34,4 +34,19 @@ fn the_committed_sample_is_what_its_readme_says() {
             assert!((0.02..0.05).contains(&z), "{z}");
         }
     }
+}
+
+#[test]
+fn the_sample_of_balls_is_what_its_readme_says() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/balls6-heldout.parquet");
+    let dataset = Dataset::open(path).unwrap();
+    let info = dataset.info();
+    assert_eq!((info.name.as_str(), info.height, info.width), ("balls6", 64, 64));
+    assert_eq!((info.frame_period_seconds, info.action_dimension()), (0.1, 0));
+
+    let episode = dataset.read(0).unwrap();
+    assert_eq!((episode.id(), episode.length(), episode.object_count()), (399, 100, Some(6)));
+    let labels = episode.data().mask.as_ref().unwrap();
+    assert!(labels.iter().all(|&label| label == 0 || (2..8).contains(&label)));
+    assert!(episode.data().contacts_objects.as_ref().unwrap().contains(&1));
 }

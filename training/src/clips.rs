@@ -94,7 +94,11 @@ impl Clips {
             })
             .collect();
         let all = Tensor::cat(&episodes.iter().map(|e| &e.actions).collect::<Vec<_>>(), 0);
-        let std: Vec<f32> = all.std_dim(Some([0i64].as_slice()), true, false).try_into()?;
+        // libtorch warns of the deviation of nothing.
+        let std: Vec<f32> = match info.actions.as_slice() {
+            [] => Vec::new(),
+            _ => all.std_dim(Some([0i64].as_slice()), true, false).try_into()?,
+        };
         let actions: Vec<ActionDimension> = info
             .actions
             .iter()

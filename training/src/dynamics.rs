@@ -4,7 +4,8 @@
 //! is imagined of its objects, so that many times as many can be learned from.
 //!
 //! What the objects are foreseen by is the agent as it was imagined: where an object is pushed, what is observed of the agent
-//! and the background tells where it went.
+//! and the background tells where it went. Where there is no agent, what surrounds the objects is taken as it was observed: it
+//! stays as it is, and imagining it would cost several times what seeing does.
 
 use std::path::Path;
 
@@ -64,7 +65,7 @@ mod part {
     /// `[E T, 3, H, W]` u8 and `[E T, ...]`.
     pub(super) const OBSERVED: [&str; 4] =
         ["mu_mix", "agent.latent", "agent.history", "agent.action"];
-    /// The same, imagined.
+    /// The same, imagined; only in scenes with an agent.
     pub(super) const IMAGINED: [&str; 4] = [
         "imagined.mu_mix",
         "imagined.agent.latent",
@@ -156,6 +157,20 @@ impl Remembered {
         (mu_mix, agent.map(|((latent, history), action)| Agent { latent, history, action }))
     }
 
+    /// What surrounds the objects `k` frames after the frames `start [B]`, of which the first one imagined is `future [B]`.
+    fn surroundings_ahead(
+        &self,
+        (start, future): (&Tensor, &Tensor),
+        k: i64,
+    ) -> (Tensor, Option<Agent>) {
+        let [mu_mix, ..] = part::IMAGINED;
+        if self.parts.iter().any(|(name, _)| name == mu_mix) {
+            self.surroundings(part::IMAGINED, &(future + k - 1))
+        } else {
+            self.surroundings(part::OBSERVED, &(start + k))
+        }
+    }
+
     fn prior(&self, rows: &Tensor) -> Memory {
         let [h, c] = part::PRIOR.map(|name| self.get(name, rows));
         Memory { h, c }
@@ -202,7 +217,7 @@ fn see(
         let names = [part::SURE, part::Z, part::IDS];
         observed.add(names, [one(&sure), slots.pick(&objects.z), one(&objects.ids)]);
         observed.add_surroundings(part::OBSERVED, seen);
-        if beginnings(length).any(|from| from == t) {
+        if model.agent_slot().is_some() && beginnings(length).any(|from| from == t) {
             let mut future = state.shallow_clone();
             for action in &batch.actions[t as usize + 1..][..HORIZON as usize] {
                 let (next, seen) = model.imagine(future, action, &noise, &tracking);
@@ -304,7 +319,7 @@ pub fn objective(
     let sure_at_first = remembered.get(part::SURE, &start);
     let mut terms = Terms::default();
     for k in 1..=recipe.length.at(step) as i64 {
-        let (mu_mix, agent) = remembered.surroundings(part::IMAGINED, &(&future + k - 1));
+        let (mu_mix, agent) = remembered.surroundings_ahead((&start, &future), k);
         let next = objects.imagine(&state, &mu_mix, agent.as_ref(), &mean, &tracking);
         let rows = &start + k;
         let [z, ids, sure] =

@@ -49,7 +49,7 @@ struct Arguments {
 enum Command {
     /// Write a checkpoint with untrained weights.
     Init {
-        /// Sizes: roll, push1, push2, bair, balls or tiny.
+        /// Sizes: roll, push1, push2, bair, balls, tiny or balls-tiny.
         #[arg(long, default_value = "tiny")]
         preset: String,
         /// Seed of the initial weights.
@@ -61,7 +61,7 @@ enum Command {
     },
     /// Train a checkpoint by a recipe.
     Train {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, or one that goes on from it (training/recipes).
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, balls-tiny, or one that goes on from them (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Data set.
@@ -87,7 +87,7 @@ enum Command {
     ///
     /// A run that was stopped goes on; one that is done is measured again.
     Ablate {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, or one that goes on from it (training/recipes).
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, balls-tiny, or one that goes on from them (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Variants to compare.

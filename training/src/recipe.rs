@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::{dynamics::HORIZON, variant::Variant};
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 15] = [
+const NAMED: [(&str, &str); 18] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -27,6 +27,9 @@ const NAMED: [(&str, &str); 15] = [
     ("tiny-following", include_str!("../recipes/tiny-following.toml")),
     ("tiny-dynamics", include_str!("../recipes/tiny-dynamics.toml")),
     ("tiny-foresight", include_str!("../recipes/tiny-foresight.toml")),
+    ("balls-tiny", include_str!("../recipes/balls-tiny.toml")),
+    ("balls-tiny-following", include_str!("../recipes/balls-tiny-following.toml")),
+    ("balls-tiny-dynamics", include_str!("../recipes/balls-tiny-dynamics.toml")),
 ];
 
 /// Parts of the names of parameters that objects are imagined with; the surroundings (the last three) are also there for

@@ -66,9 +66,20 @@ kl = 0.001
 networks = { recurrent = 16, latent = 4, mlp = 16, samples = 2 }
 "#;
 
+/// The same without an agent, and so without keypoints.
+fn without_agent() -> String {
+    let (without_keypoints, _) = RECIPE.split_once("[keypoints]").unwrap();
+    without_keypoints.replace("model = \"tiny\"", "model = \"balls-tiny\"")
+}
+
 /// What a run in `folder` that stops at each of `stops` ends with.
-fn trained(clips: &Clips, folder: &Path, stops: &[u64]) -> (Header, Vec<(String, Tensor)>) {
-    let recipe: Recipe = toml::from_str(RECIPE).unwrap();
+fn trained(
+    recipe: &str,
+    clips: &Clips,
+    folder: &Path,
+    stops: &[u64],
+) -> (Header, Vec<(String, Tensor)>) {
+    let recipe: Recipe = toml::from_str(recipe).unwrap();
     for &stop in stops {
         let mut trainer =
             Trainer::open(recipe.clone(), clips, "sample", 7, folder, Device::Cpu).unwrap();
@@ -81,16 +92,26 @@ fn trained(clips: &Clips, folder: &Path, stops: &[u64]) -> (Header, Vec<(String,
     (checkpoint.header, weights)
 }
 
+fn check(recipe: &str, sample: &str) {
+    tch::set_num_threads(1);
+    let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples");
+    let dataset = Dataset::open(samples.join(sample)).unwrap();
+    let clips = Clips::read(&dataset, 0..dataset.len().min(2)).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let run = |name: &str, stops: &[u64]| trained(recipe, &clips, &folder.path().join(name), stops);
+    let once = run("once", &[STEPS]);
+    let resumed = run("resumed", &[1, 3, 4, STEPS]);
+    assert!(once == resumed, "the resumed run ended with other weights");
+    let other = run("other", &[STEPS - 1]);
+    assert!(once != other, "the last step changed nothing");
+}
+
 #[test]
 fn a_resumed_run_ends_where_an_uninterrupted_one_does() {
-    tch::set_num_threads(1);
-    let sample =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples/push1-heldout.parquet");
-    let clips = Clips::read(&Dataset::open(sample).unwrap(), 0..2).unwrap();
-    let folder = tempfile::tempdir().unwrap();
-    let once = trained(&clips, &folder.path().join("once"), &[STEPS]);
-    let resumed = trained(&clips, &folder.path().join("resumed"), &[1, 3, 4, STEPS]);
-    assert!(once == resumed, "the resumed run ended with other weights");
-    let other = trained(&clips, &folder.path().join("other"), &[STEPS - 1]);
-    assert!(once != other, "the last step changed nothing");
+    check(RECIPE, "push1-heldout.parquet");
+}
+
+#[test]
+fn so_does_one_in_scenes_without_an_agent() {
+    check(&without_agent(), "balls6-heldout.parquet");
 }

@@ -8,7 +8,7 @@ use super::{
 };
 
 /// Names that [`preset`] knows.
-pub const NAMES: [&str; 6] = ["roll", "push1", "push2", "bair", "balls", "tiny"];
+pub const NAMES: [&str; 7] = ["roll", "push1", "push2", "bair", "balls", "tiny", "balls-tiny"];
 
 /// The preset called `name`.
 pub fn preset(name: &str) -> Option<GatsbiConfig> {
@@ -19,6 +19,7 @@ pub fn preset(name: &str) -> Option<GatsbiConfig> {
         "bair" => Some(bair()),
         "balls" => Some(balls()),
         "tiny" => Some(tiny()),
+        "balls-tiny" => Some(balls_tiny()),
         _ => None,
     }
 }
@@ -120,6 +121,21 @@ pub fn tiny() -> GatsbiConfig {
         },
         tracking: Tracking::serving(),
     }
+}
+
+/// BALLS with the sizes of [`tiny`].
+pub fn balls_tiny() -> GatsbiConfig {
+    let mut config = tiny();
+    config.action.dim = 0;
+    config.detector = None;
+    // The box is one thing; two is the fewest.
+    config.mixture.slots = 2;
+    config.objects.interaction = Interaction::Inter1;
+    // A cell finds one object, and balls are close together: a cell of 8 pixels seldom holds the centres of two.
+    config.objects.grid = 8;
+    // Balls pass in front of each other, and move little in a frame: what overlaps a known one less is another.
+    config.objects.rejection = Some(0.5);
+    config
 }
 
 /// What differs between the paper's data sets (mixture spec 1.3).
