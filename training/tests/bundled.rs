@@ -1,4 +1,5 @@
-//! The bundled checkpoint follows objects whose boxes lie beside them, and its beliefs stay sound.
+//! The bundled checkpoints do what their cards say: `push1-tiny` follows objects whose boxes lie beside them, and its beliefs
+//! stay sound; `balls-tiny` finds and foresees balls.
 
 #![expect(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -12,27 +13,32 @@ use gatsbi_models::{
     scene::{Output, Outputs},
     world_model::WorldModel as _,
 };
-use gatsbi_training::clips::Clips;
+use gatsbi_training::{
+    clips::Clips,
+    evaluation::report::{Protocol, report},
+};
 use tch::{Device, Kind, Tensor};
 
 /// How far boxes are moved, in pixels to the right and up: an object's side is five to seven.
 const JOLT: [f32; 2] = [3.0, -2.0];
 
-fn bundled() -> Checkpoint {
-    let file =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/checkpoints/push1-tiny.safetensors");
-    Checkpoint::load(&file, Device::Cpu).unwrap()
+fn bundled(name: &str) -> Checkpoint {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/checkpoints");
+    Checkpoint::load(&folder.join(format!("{name}.safetensors")), Device::Cpu).unwrap()
+}
+
+fn sample(name: &str) -> Dataset {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples");
+    Dataset::open(folder.join(format!("{name}-heldout.parquet"))).unwrap()
 }
 
 fn heldout() -> Clips {
-    let sample =
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples/push1-heldout.parquet");
-    Clips::read(&Dataset::open(sample).unwrap(), 0..2).unwrap()
+    Clips::read(&sample("push1"), 0..2).unwrap()
 }
 
 #[test]
 fn a_belief_of_hundreds_of_frames_is_as_good_as_one_of_forty() {
-    let world = GatsbiWorld::new(bundled());
+    let world = GatsbiWorld::new(bundled("push1-tiny"));
     let clips = heldout();
     let length = clips.shortest();
     let batch = clips.beginnings(0..2, length, Device::Cpu);
@@ -61,7 +67,7 @@ fn a_belief_of_hundreds_of_frames_is_as_good_as_one_of_forty() {
 #[test]
 fn an_object_beside_its_box_is_caught_in_the_next_frame() {
     let _no_grad = tch::no_grad_guard();
-    let (model, clips) = (bundled().model, heldout());
+    let (model, clips) = (bundled("push1-tiny").model, heldout());
     let batch = clips.beginnings(0..2, 5, Device::Cpu);
     let (noise, tracking) = (PhiloxNoise::mean(2, Device::Cpu), model.config().tracking);
     let half_side = model.config().image_size as f32 / 2.0;
@@ -98,4 +104,16 @@ fn an_object_beside_its_box_is_caught_in_the_next_frame() {
     left.sort_by(f32::total_cmp);
     let median = left[left.len() / 2];
     assert!(median < 1.2, "boxes moved by 3.6 pixels are still {median} off: {left:?}");
+}
+
+#[test]
+fn balls_are_found_and_foreseen() {
+    let world = GatsbiWorld::new(bundled("balls-tiny"));
+    let protocol = Protocol { horizon: 15, samples: 0, perceptual: None };
+    let numbers = report(&world, &sample("balls6"), 0..1, protocol, |_| {}).unwrap().numbers;
+    for name in ["object_recall", "object_precision"] {
+        assert!(numbers[name] > 0.8, "{name} is {}", numbers[name]);
+    }
+    let gain = numbers["psnr_gain_over_copy_db"];
+    assert!(gain > 1.0, "imagination is {gain} dB better than the last frame");
 }

@@ -17,8 +17,9 @@ use crate::process::{Interrupt, Running};
 use crate::server::Server;
 use crate::setup;
 
+/// What is shown, and the checkpoint that knows such scenes.
 const SAMPLES: &str = "episodes/samples/push1-heldout.parquet";
-const BUNDLED: &str = "models/checkpoints";
+const BUNDLED: &str = "models/checkpoints/push1-tiny.safetensors";
 
 /// For the demonstration to end in.
 const GRACE: Duration = Duration::from_secs(30);
@@ -57,12 +58,12 @@ pub(crate) fn demo(root: &Path, arguments: &Arguments) -> Result<()> {
     let out = arguments.out.clone().unwrap_or_else(|| short(&root.join("demo-out")));
     fs::create_dir_all(&out)?;
 
-    let bundled = || bundled(&root.join(BUNDLED));
-    let checkpoint =
-        match arguments.checkpoint.clone().map_or_else(bundled, |file| Ok(Some(file)))? {
-            Some(checkpoint) => checkpoint,
-            None => untrained(programs.named("gatsbi-train")?, &out)?,
-        };
+    let bundled = root.join(BUNDLED);
+    let checkpoint = match &arguments.checkpoint {
+        Some(file) => file.clone(),
+        None if bundled.is_file() => bundled,
+        None => untrained(programs.named("gatsbi-train")?, &out)?,
+    };
     let log = out.join("server.log");
     let mut command = Command::new(programs.named("gatsbi-server")?);
     command.arg("--checkpoint").arg(&checkpoint);
@@ -79,17 +80,6 @@ pub(crate) fn demo(root: &Path, arguments: &Arguments) -> Result<()> {
     let stopped = server.process.stop();
     shown?;
     stopped.with_context(|| format!("its log is {}", log.display()))
-}
-
-/// The first of the checkpoints that come with the sources.
-fn bundled(folder: &Path) -> Result<Option<PathBuf>> {
-    if !folder.is_dir() {
-        return Ok(None);
-    }
-    let files = fs::read_dir(folder)?.map(|entry| Ok(entry?.path()));
-    let mut files = files.collect::<Result<Vec<_>>>()?;
-    files.retain(|file| file.extension().is_some_and(|extension| extension == "safetensors"));
-    Ok(files.into_iter().min())
 }
 
 /// A model that has learned nothing, and shows as much.
@@ -120,20 +110,4 @@ fn short(path: &Path) -> PathBuf {
     let here = env::current_dir().ok();
     let short = here.as_deref().and_then(|here| path.strip_prefix(here).ok());
     short.unwrap_or(path).to_owned()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_first_bundled_checkpoint_is_taken() {
-        let folder = tempfile::tempdir().unwrap();
-        assert_eq!(bundled(&folder.path().join("none")).unwrap(), None);
-        assert_eq!(bundled(folder.path()).unwrap(), None);
-        for name in ["b.safetensors", "a.safetensors", "0.md"] {
-            fs::write(folder.path().join(name), "").unwrap();
-        }
-        assert_eq!(bundled(folder.path()).unwrap(), Some(folder.path().join("a.safetensors")));
-    }
 }
