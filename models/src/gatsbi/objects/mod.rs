@@ -251,7 +251,7 @@ impl ObjectModule {
         let next = match tracking.merge {
             Some(threshold) => {
                 let unlike = tracking.unlike.map(|unlike| {
-                    let own = self.placed(&next.z).colour;
+                    let own = render::colour(&self.decoder.forward(&self.latents(&next.z).what));
                     squared(&own.unsqueeze(2), &own.unsqueeze(1)).gt(unlike.powi(2))
                 });
                 merged(next, threshold, unlike.as_ref())
@@ -399,8 +399,11 @@ impl ObjectModule {
         train: bool,
     ) -> Discovered {
         let (z, frame) = (propagated.z.shallow_clone(), scenery.frame);
-        let own = tracking.unlike.map(|unlike| (self.placed(&state.z).colour, unlike));
-        let known = own.as_ref().map(|(own, unlike)| Known {
+        let looks = tracking.unlike.map(|unlike| {
+            let glimpses = self.decoder.forward(&self.latents(&state.z).what);
+            (render::colour(&glimpses), glimpses, unlike)
+        });
+        let known = looks.as_ref().map(|(own, _, unlike)| Known {
             z: &z,
             ids: &state.ids,
             own,
@@ -411,11 +414,11 @@ impl ObjectModule {
         let handover = handover.map(|(known, reach)| (known, known.lost(), reach));
         let seen =
             handover.as_ref().map_or_else(|| z.shallow_clone(), |(_, lost, _)| absent(&z, lost));
-        let input = match &handover {
+        let input = match looks.as_ref().filter(|_| handover.is_some()) {
             // What is known is explained, so that what is beside it shows as if it were alone.
-            Some(_) => {
-                let alpha = self.render(&seen).alpha;
-                let rest = frame + (scenery.residual_mix - frame) * alpha;
+            Some((_, glimpses, _)) => {
+                let known = render::covered(glimpses, &seen, self.layout, self.image_size);
+                let rest = frame + (scenery.residual_mix - frame) * known;
                 discovery::input(&rest, scenery.residual_mix)
             }
             None => discovery::input(frame, scenery.residual_mix),

@@ -57,6 +57,21 @@ pub(crate) fn render(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout, side:
     }
 }
 
+/// How far objects `z [B, N, Z]` whose boxes show `glimpses [B, N, 4, s, s]` cover an image of `side` pixels, `[B, 1, H, W]` in
+/// [0, 1].
+pub(crate) fn covered(glimpses: &Tensor, z: &Tensor, layout: Layout, side: i64) -> Tensor {
+    let Latents { pres, place: z_where, .. } = layout.split(z);
+    let alpha = glimpses.narrow(2, 3, 1) * pres.unsqueeze(-1).unsqueeze(-1);
+    place(&alpha, &z_where, side).amax(1, false)
+}
+
+/// Mean colours of what `glimpses [B, N, 4, s, s]` show, `[B, N, 3]` in [0, 1].
+pub(crate) fn colour(glimpses: &Tensor) -> Tensor {
+    let alpha = glimpses.narrow(2, 3, 1); // [B, N, 1, s, s]
+    let sum = |x: &Tensor| x.sum_dim_intlist([3i64, 4].as_slice(), false, Kind::Float);
+    sum(&(glimpses.narrow(2, 0, 3) * &alpha)) / (sum(&alpha) + EPS)
+}
+
 /// Where objects `z [B, N, Z]` are.
 pub(crate) fn placed(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Placed {
     let Latents { pres, place, what, .. } = layout.split(z);
@@ -65,14 +80,13 @@ pub(crate) fn placed(decoder: &GlimpseDecoder, z: &Tensor, layout: Layout) -> Pl
     let line = pixel_centres(alpha.size()[3], &alpha);
     let total = alpha.sum_dim_intlist([2i64, 3].as_slice(), false, Kind::Float) + EPS;
     let painted = glimpses.narrow(2, 0, 3) * alpha.unsqueeze(2); // [B, N, 3, s, s]
-    let colour = painted.sum_dim_intlist([3i64, 4].as_slice(), false, Kind::Float);
     let middle = |across: i64| {
         let along = alpha.sum_dim_intlist(across, false, Kind::Float);
         (along * &line).sum_dim_intlist(-1, false, Kind::Float) / &total
     };
     let within = Tensor::stack(&[middle(2), middle(3)], -1);
     Placed {
-        colour: colour / total.unsqueeze(-1),
+        colour: colour(&glimpses),
         drawn: Tensor::cat(&[painted, alpha.unsqueeze(2)], 2),
         presence: pres,
         centre: place.narrow(-1, 2, 2),
