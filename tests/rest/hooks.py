@@ -24,6 +24,7 @@ BEYOND_SCHEMAS = {
         r"(observation\.action|action_m(in|ax)|.*\.(weights|previous))(\[\d+\])?|hold"
     ),
     "an object that is in the scene": r".*\.object_id",
+    "what the goal was put with": r".*\.goal_id",
     "what the operator allows": (
         r"ttl|keep_(steps|frames)|horizon|random|sampling\.samples|candidates|(.*\.)?(cem|mppi|random_shooting)\.candidates"
     ),

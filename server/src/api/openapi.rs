@@ -108,7 +108,7 @@ fn describe(operation: &Operation, schemas: &mut Schemas<'_>) -> Json {
             json!({ LINES: { "schema": lines(&message()) }, JSON: { "schema": message() } })
         }
     };
-    described["requestBody"] = json!({ "content": content });
+    described["requestBody"] = request_body(&rpc.input, &content);
     described
 }
 
@@ -134,6 +134,12 @@ fn answer(operation: &Operation, output: &str) -> Json {
         }
         _ => json!({ JSON: { "schema": message }, PROTOBUF: {} }),
     }
+}
+
+/// A body, which may be left out where the message may be empty.
+fn request_body(message: &str, content: &Json) -> Json {
+    let name = message.rsplit('.').next().unwrap_or_default();
+    json!({ "content": content, "required": requirements::needs_anything(name) })
 }
 
 /// Lines, as an array of what each of them is: so `OpenAPI` 3.2 reads schemas of sequential media types.

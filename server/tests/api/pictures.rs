@@ -122,6 +122,10 @@ async fn what_cannot_be_shown_is_refused_with_its_reason() {
         assert_eq!(refused(at(name)).await, (400, "INVALID_FIELDS".into(), field.into()), "{name}");
     }
     assert_eq!(refused(at("frame.png?scal=2")).await.1, "MALFORMED_BODY");
+    let shape = json!([u32::MAX, u32::MAX, 7]);
+    let actions = json!({ "actions": { "dtype": "DATA_TYPE_F32", "shape": shape } });
+    let (status, problem) = server.post_json(&at("rollout.png"), &actions).await;
+    assert_eq!((status, &problem["fields"][0]["field"]), (400, &json!("actions")), "{problem}");
 
     let (status, _) = server.post_json(&at("rewind"), &json!({ "to_step": 1 })).await;
     assert_eq!(status, 200);

@@ -44,6 +44,11 @@ pub(super) fn needs_a_choice(message: &str) -> bool {
     ["CostTerm", "Image", "Start", "Subject"].contains(&message)
 }
 
+/// Whether a message with nothing in it is refused.
+pub(super) fn needs_anything(message: &str) -> bool {
+    !required(message).is_empty() || message == "PutGoalRequest"
+}
+
 /// What holds for a field beside its type.
 pub(super) fn field(message: &str, field: &str) -> Json {
     match (message, field) {
@@ -73,6 +78,9 @@ pub(super) fn field(message: &str, field: &str) -> Json {
         ("Context", "frames") => tensor(&[U8], 4, 4),
         ("Image", "pixels") => tensor(&[U8, F32], 3, 3),
         ("MaskGoal", "masks") => tensor(&[U8, F32], 2, 3),
+        // Costs are sums without bounds, and JSON has no infinity.
+        ("PlanResponse", "cost" | "violation") => overflowing(&["number", "string", "null"]),
+        ("PlanResponse", "best_costs") => json!({ "items": overflowing(&["number", "string"]) }),
         ("Subject", "agent" | "all_objects") => json!({ "enum": [true, null] }),
         ("CostProgram", "terms") => json!({ "minItems": 1, "maxItems": TERMS }),
         ("CostProgram", "constraints") => json!({ "maxItems": TERMS }),
@@ -276,6 +284,11 @@ fn tensor(types: &[&str], least: usize, most: usize) -> Json {
             "shape": { "type": "array", "minItems": least, "maxItems": most },
         },
     })
+}
+
+/// Numbers that may be infinite, as the JSON of protobuf writes them.
+fn overflowing(types: &[&str]) -> Json {
+    json!({ "type": types, "pattern": "^(NaN|-?Infinity)$" })
 }
 
 fn within(Numbers { least, most }: Numbers) -> Json {

@@ -3,7 +3,7 @@
 use serde_json::{Value as Json, json};
 
 use super::{
-    JSON, PROTOBUF, path_parameters, problem_answer, query_parameters, requirements,
+    JSON, PROTOBUF, path_parameters, problem_answer, query_parameters, request_body, requirements,
     schemas::reference,
 };
 
@@ -215,8 +215,8 @@ pub(super) fn describe(showing: &Showing) -> Json {
     if showing.body {
         let mut message = reference(".gatsbi.v1.ImagineRequest");
         requirements::add(&mut message, requirements::body(showing.id));
-        described["requestBody"] =
-            json!({ "content": { JSON: { "schema": message }, PROTOBUF: {} } });
+        let content = json!({ JSON: { "schema": message }, PROTOBUF: {} });
+        described["requestBody"] = request_body(".gatsbi.v1.ImagineRequest", &content);
     }
     described
 }

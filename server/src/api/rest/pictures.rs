@@ -306,7 +306,8 @@ fn check_size(request: &v1::ImagineRequest, every: u32, side: u64) -> Result<(),
     let shape = request.actions.as_ref().map_or(&[][..], |actions| &actions.shape);
     let rows = if let [candidates, _, _] = shape { u64::from(*candidates) } else { 1 };
     let horizon = shape.iter().rev().nth(1).copied().unwrap_or(1);
-    let pixels = rows * u64::from(horizon / every) * side * side;
+    let factors = [rows, (horizon / every).into(), side, side];
+    let pixels = factors.into_iter().fold(1, u64::saturating_mul);
     if pixels > MAX_PIXELS {
         let expected = format!("at most {MAX_PIXELS} pixels: fewer candidates, every, or scale");
         return Err(Error::invalid("actions", format!("{pixels} pixels"), expected));
