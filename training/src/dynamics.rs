@@ -11,6 +11,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use gatsbi_models::{
+    config::Tracking,
     gatsbi::{
         loss,
         mixture::Memory,
@@ -85,9 +86,10 @@ mod part {
 }
 
 impl Remembered {
-    /// Sees all of the data once; `progress` is told how many episodes have been.
+    /// Sees all of the data once by the rules of `tracking`; `progress` is told how many episodes have been.
     pub fn by(
         model: &Gatsbi,
+        tracking: Tracking,
         clips: &Clips,
         device: Device,
         mut progress: impl FnMut(usize),
@@ -97,7 +99,7 @@ impl Remembered {
         let mut seen: Vec<Vec<(String, Tensor)>> = Vec::new();
         for from in (0..clips.len()).step_by(AT_ONCE) {
             let until = clips.len().min(from + AT_ONCE);
-            seen.push(see(model, clips, from..until, length, device));
+            seen.push(see((model, tracking), clips, from..until, length, device));
             progress(until);
         }
         let names: Vec<String> =
@@ -184,7 +186,7 @@ impl Remembered {
 
 /// All parts of some episodes.
 fn see(
-    model: &Gatsbi,
+    (model, tracking): (&Gatsbi, Tracking),
     clips: &Clips,
     episodes: std::ops::Range<usize>,
     length: i64,
@@ -192,7 +194,7 @@ fn see(
 ) -> Vec<(String, Tensor)> {
     let batch = clips.beginnings(episodes, length, device);
     let rows = batch.frames[0].size()[0];
-    let (noise, tracking) = (PhiloxNoise::mean(rows, device), model.config().tracking);
+    let noise = PhiloxNoise::mean(rows, device);
     let mut state = model.initial_state(rows);
     let mut slots = Slots::new(&state.objects.ids);
     let (mut observed, mut imagined) = (Frames::default(), Frames::default());

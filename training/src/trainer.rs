@@ -60,7 +60,7 @@ pub struct Trainer {
     learning_store: ParamStore,
     adam: Adam,
     progress: Progress,
-    /// What the run started from: it remembers what dynamics are learned from, as it sees with all that it has learned.
+    /// What the run started from, if it has learned what the run has not: it then remembers what dynamics are learned from.
     seeing: Option<Gatsbi>,
     /// Names of the parameters that what the run started from has not.
     untrained: Vec<String>,
@@ -170,7 +170,7 @@ impl Trainer {
         let header = Header { agent_slot: loaded.header.agent_slot, ..header };
         self.checkpoint = Checkpoint::untrained(header, self.device);
         self.untrained = self.checkpoint.store.take(&loaded.store);
-        self.seeing = Some(loaded.model);
+        self.seeing = (!self.untrained.is_empty()).then_some(loaded.model);
         Ok(())
     }
 
@@ -287,7 +287,8 @@ impl Trainer {
         };
         let seeing = self.seeing.take();
         let model = seeing.as_ref().unwrap_or(&self.checkpoint.model);
-        let remembered = Remembered::by(model, clips, self.device, told);
+        let tracking = self.checkpoint.header.model.tracking;
+        let remembered = Remembered::by(model, tracking, clips, self.device, told);
         remembered.write(&path)?;
         Ok(remembered)
     }

@@ -5,7 +5,7 @@ use tch::{Kind, Tensor};
 
 use super::{
     gather_rows,
-    latents::{looking_like, place, presence, shift, with_presence},
+    latents::{absent, looking_like, place, presence, shift, with_presence},
 };
 use crate::nn::spatial_transformer::crop;
 
@@ -22,10 +22,12 @@ const COVERED: f64 = 0.51;
 pub(super) struct Known<'a> {
     /// Latent vectors, `[B, N, Z]`.
     pub(super) z: &'a Tensor,
+    /// The same a frame earlier, `[B, N, Z]`.
+    pub(super) before: &'a Tensor,
     /// Identities, `[B, N]`.
     pub(super) ids: &'a Tensor,
     /// Colours that they are known to have, `[B, N, 3]`.
-    pub(super) own: &'a Tensor,
+    pub(super) own: Tensor,
     /// The frame, `[B, 3, H, W]`.
     pub(super) frame: &'a Tensor,
     /// Distance between colours above which they are of different objects.
@@ -44,48 +46,44 @@ impl Known<'_> {
         squared(&seen, &behind).le(self.unlike.powi(2))
     }
 
-    /// Which are not to be seen where they are thought to be, `[B, N]` bool.
-    pub(super) fn lost(&self) -> Tensor {
-        let differs = squared(self.own, &colours(self.frame, self.z)).gt(self.unlike.powi(2));
-        differs.logical_or(&present(self.z).logical_not()).logical_and(&self.ids.ge(0))
+    /// The objects without those that are lost: not to be seen where they are thought to be.
+    pub(super) fn seen(&self) -> Tensor {
+        let differs = squared(&self.own, &colours(self.frame, self.z)).gt(self.unlike.powi(2));
+        absent(self.z, &differs.logical_and(&self.ids.ge(0)))
     }
 
-    /// The known objects, and what is left of `found [B, D, Z]`, after `lost` ones have become what is likely them: one of the
-    /// finds, or an object that is known since later, not farther than `reach`. `before [B, N, Z]` are the objects a frame earlier.
-    pub(super) fn recognised(
-        &self,
-        found: &Tensor,
-        lost: &Tensor,
-        before: &Tensor,
-        reach: f64,
-    ) -> (Tensor, Tensor) {
+    /// The known objects, and what is left of `found [B, D, Z]`, after those that are not `seen` have become what is likely
+    /// them: one of the finds, or an object that is known since later, not farther than `reach`.
+    pub(super) fn recognised(&self, found: &Tensor, seen: &Tensor, reach: f64) -> (Tensor, Tensor) {
         let finds = found.size()[1];
-        let pool = Tensor::cat(&[found, &absent(self.z, lost)], 1); // [B, D + N, Z]
+        let lost = present(seen).logical_not().logical_and(&self.ids.ge(0));
+        let pool = Tensor::cat(&[found, seen], 1); // [B, D + N, Z]
         let way = squared(&shift(&pool).unsqueeze(2), &shift(self.z).unsqueeze(1)) / reach.powi(2);
         let difference = self.difference(&pool);
-        let later = self.ids.unsqueeze(2).greater_tensor(&self.ids.unsqueeze(1)); // [b, j, i]: j is known since later
-        let may = Tensor::cat(
-            &[later.ones_like().narrow(1, 0, 1).expand([-1, finds, -1], false), later],
-            1,
-        )
-        .logical_and(&present(&pool).unsqueeze(2))
-        .logical_and(&lost.unsqueeze(1))
-        .logical_and(&difference.lt(1.0))
-        .logical_and(&way.lt(1.0));
+        let newest =
+            self.ids.new_full([found.size()[0], finds], i64::MAX, (Kind::Int64, self.ids.device()));
+        let since = Tensor::cat(&[&newest, self.ids], 1);
+        let may = since
+            .unsqueeze(2)
+            .greater_tensor(&self.ids.unsqueeze(1))
+            .logical_and(&present(&pool).unsqueeze(2))
+            .logical_and(&lost.unsqueeze(1))
+            .logical_and(&difference.lt(1.0))
+            .logical_and(&way.lt(1.0));
         let cost = (difference + way).masked_fill(&may.logical_not(), f64::INFINITY);
         let (least, best) = cost.min_dim(1, false); // [B, N] into the pool
         let whose = cost.argmin(2, false).gather(1, &best, false);
         let itself = Tensor::arange(best.size()[1], (Kind::Int64, best.device()));
         let recognised = whose.eq_tensor(&itself).logical_and(&least.isfinite()); // [B, N]
-        let taken = present(&pool).zeros_like().to_kind(Kind::Int64);
-        let taken = taken.scatter_add(1, &best, &recognised.to_kind(Kind::Int64)).gt(0);
+        let taken =
+            since.zeros_like().scatter_add(1, &best, &recognised.to_kind(Kind::Int64)).gt(0);
         // It is where it was found, and looks as it did before it was lost, as does one that is kept in mind.
         let there = gather_rows(&pool, &best).where_self(&recognised.unsqueeze(-1), self.z);
         let covered = lost.logical_and(&recognised.logical_not()).unsqueeze(-1);
         let pres = presence(&there);
         let pres = pres.clamp_max(COVERED).where_self(&covered, &pres);
         let there = with_presence(&there, &pres);
-        let z = looking_like(&there, before).where_self(&lost.unsqueeze(-1), &there);
+        let z = looking_like(&there, self.before).where_self(&lost.unsqueeze(-1), &there);
         let left = absent(found, &taken.narrow(1, 0, finds));
         (absent(&z, &taken.narrow(1, finds, best.size()[1])), left)
     }
@@ -97,9 +95,9 @@ impl Known<'_> {
     }
 }
 
-/// `z [B, N, Z]` without the objects in `which [B, N]`.
-pub(super) fn absent(z: &Tensor, which: &Tensor) -> Tensor {
-    with_presence(z, &presence(z).masked_fill(&which.unsqueeze(-1), 0.0))
+/// Which pairs of objects of colours `own [B, N, 3]` are of different ones, `[B, N, N]` bool.
+pub(super) fn different(own: &Tensor, unlike: f64) -> Tensor {
+    squared(&own.unsqueeze(2), &own.unsqueeze(1)).gt(unlike.powi(2))
 }
 
 /// Which of the objects `z [B, N, Z]` are present, `[B, N]` bool.
@@ -108,7 +106,7 @@ fn present(z: &Tensor) -> Tensor {
 }
 
 /// Squared distances over the last axis.
-pub(super) fn squared(a: &Tensor, b: &Tensor) -> Tensor {
+fn squared(a: &Tensor, b: &Tensor) -> Tensor {
     (a - b).square().sum_dim_intlist(-1, false, Kind::Float)
 }
 
@@ -157,6 +155,7 @@ mod tests {
     /// Red and blue objects, known at (20, 20) and (44, 20).
     struct Case {
         z: Tensor,
+        before: Tensor,
         ids: Tensor,
         own: Tensor,
         frame: Tensor,
@@ -166,23 +165,23 @@ mod tests {
         fn new(frame: Tensor) -> Self {
             let own = Tensor::from_slice(&[RED, BLUE].concat()).view([1, 2, 3]);
             let z = objects(&[(20, 20), (44, 20)], 10.0);
-            Self { z, ids: Tensor::from_slice(&[3i64, 5]).unsqueeze(0), own, frame }
+            let before = objects(&[(20, 20), (44, 20)], 70.0);
+            Self { z, before, ids: Tensor::from_slice(&[3i64, 5]).unsqueeze(0), own, frame }
         }
 
         fn known(&self) -> Known<'_> {
-            let Self { z, ids, own, frame } = self;
-            Known { z, ids, own, frame, unlike: 0.3 }
+            let Self { z, before, ids, own, frame } = self;
+            Known { z, before, ids, own: own.shallow_clone(), frame, unlike: 0.3 }
         }
 
         /// Lost ones, the objects' places and latent vectors, and how present what is left of the finds is.
         fn after(&self, found: &Tensor) -> (Vec<bool>, Vec<[f32; 2]>, Tensor, Vec<f32>) {
             let known = self.known();
-            let lost = known.lost();
-            let before = objects(&[(20, 20), (44, 20)], 70.0);
-            let (z, left) = known.recognised(found, &lost, &before, 0.5);
+            let seen = known.seen();
+            let (z, left) = known.recognised(found, &seen, 0.5);
             let places = values(&z, 4).into_iter().zip(values(&z, 5));
             let pixel = |at: f32| (at + 1.0) * 32.0;
-            let lost = Vec::try_from(lost.squeeze_dim(0)).expect("a row of flags");
+            let lost = values(&seen, 0).iter().map(|presence| *presence == 0.0).collect();
             let places = places.map(|(x, y)| [pixel(x), pixel(y)]).collect();
             (lost, places, z, values(&left, 0))
         }
@@ -221,10 +220,11 @@ mod tests {
     fn one_that_is_known_twice_keeps_the_older_identity() {
         let mut case = Case::new(frame(&[(RED, 30, 20)]));
         case.z = objects(&[(20, 20), (30, 20)], 10.0);
+        case.before = case.z.shallow_clone();
         case.own = Tensor::from_slice(&[RED, RED].concat()).view([1, 2, 3]);
         let known = case.known();
         let none = absent(&case.z, &Tensor::ones([1, 2], (Kind::Bool, Device::Cpu)));
-        let (z, _) = known.recognised(&none, &known.lost(), &case.z, 0.5);
+        let (z, _) = known.recognised(&none, &known.seen(), 0.5);
         assert_eq!(values(&z, 0), [1.0, 0.0]);
         assert!((values(&z, 4)[0] - (30.0 / 32.0 - 1.0)).abs() < 1e-6, "{z}");
     }

@@ -74,6 +74,11 @@ pub(crate) fn with_presence(z: &Tensor, pres: &Tensor) -> Tensor {
     Tensor::cat(&[pres, &z.narrow(-1, 1, z.size()[2] - 1)], -1)
 }
 
+/// Latent vectors `z [B, N, Z]` without the objects in `which [B, N]`.
+pub(crate) fn absent(z: &Tensor, which: &Tensor) -> Tensor {
+    with_presence(z, &presence(z).masked_fill(&which.unsqueeze(-1), 0.0))
+}
+
 /// Latent vectors `z [..., Z]` that look, and move, as those in `other`.
 pub(crate) fn looking_like(z: &Tensor, other: &Tensor) -> Tensor {
     let rest = other.size()[other.dim() - 1] - WHAT;

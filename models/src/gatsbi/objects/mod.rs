@@ -28,8 +28,8 @@ pub use self::{
 use self::{
     discovery::{Discovered, Discovery},
     glimpse::GlimpseDecoder,
-    handover::{Known, absent, squared},
-    latents::{Layout, SHIFT, place, presence, shift},
+    handover::{Known, different},
+    latents::{Layout, SHIFT, absent, place, presence, shift},
     memory::ObjectMemory,
     propagation::{Propagated, Propagation},
     surroundings::Surroundings,
@@ -250,10 +250,9 @@ impl ObjectModule {
         };
         let next = match tracking.merge {
             Some(threshold) => {
-                let unlike = tracking.unlike.map(|unlike| {
-                    let own = render::colour(&self.decoder.forward(&self.latents(&next.z).what));
-                    squared(&own.unsqueeze(2), &own.unsqueeze(1)).gt(unlike.powi(2))
-                });
+                let unlike = tracking
+                    .unlike
+                    .map(|unlike| different(&render::colour(&self.looks(&next.z)), unlike));
                 merged(next, threshold, unlike.as_ref())
             }
             None => next,
@@ -388,6 +387,11 @@ impl ObjectModule {
         ]
     }
 
+    /// What the boxes of objects `z [B, N, Z]` show, `[B, N, 4, s, s]`.
+    fn looks(&self, z: &Tensor) -> Tensor {
+        self.decoder.forward(&self.latents(z).what)
+    }
+
     /// New objects of a frame. With [`Tracking::handover`] known ones that are lost become what is found of them.
     fn discover(
         &self,
@@ -398,44 +402,36 @@ impl ObjectModule {
         tracking: &Tracking,
         train: bool,
     ) -> Discovered {
-        let (z, frame) = (propagated.z.shallow_clone(), scenery.frame);
-        let looks = tracking.unlike.map(|unlike| {
-            let glimpses = self.decoder.forward(&self.latents(&state.z).what);
-            (render::colour(&glimpses), glimpses, unlike)
-        });
-        let known = looks.as_ref().map(|(own, _, unlike)| Known {
-            z: &z,
-            ids: &state.ids,
-            own,
-            frame,
-            unlike: *unlike,
+        let (frame, mu_mix) = (scenery.frame, scenery.residual_mix);
+        let z = propagated.z.shallow_clone();
+        let known = tracking.unlike.map(|unlike| {
+            let looks = self.looks(&state.z);
+            let own = render::colour(&looks);
+            (Known { z: &z, before: &state.z, ids: &state.ids, own, frame, unlike }, looks)
         });
         let handover = known.as_ref().zip(tracking.handover);
-        let handover = handover.map(|(known, reach)| (known, known.lost(), reach));
-        let seen =
-            handover.as_ref().map_or_else(|| z.shallow_clone(), |(_, lost, _)| absent(&z, lost));
-        let input = match looks.as_ref().filter(|_| handover.is_some()) {
-            // What is known is explained, so that what is beside it shows as if it were alone.
-            Some((_, glimpses, _)) => {
-                let known = render::covered(glimpses, &seen, self.layout, self.image_size);
-                let rest = frame + (scenery.residual_mix - frame) * known;
-                discovery::input(&rest, scenery.residual_mix)
+        let (seen, rest) = match handover {
+            Some(((known, looks), _)) => {
+                let seen = known.seen();
+                // What is known is explained, so that what is beside it shows as if it were alone.
+                let covered = render::covered(looks, &seen, self.layout, self.image_size);
+                (seen, frame + (mu_mix - frame) * covered)
             }
-            None => discovery::input(frame, scenery.residual_mix),
+            None => (z.shallow_clone(), frame.shallow_clone()),
         };
+        let input = discovery::input(&rest, mu_mix);
         let mut found = self.discovery.posterior(&input, &seen, noise, train);
         if let Some(threshold) = self.rejection {
             let same = discovery::overlapped(&found.place(), &seen, threshold);
             let same = match &known {
-                Some(known) => same.logical_and(&known.alike(&found.z)),
+                Some((known, _)) => same.logical_and(&known.alike(&found.z)),
                 None => same,
             };
             found.z = absent(&found.z, &same.any_dim(-1, false));
         }
-        if let Some((known, lost, reach)) = handover {
-            let nothing = known.nothing_at(&found.z, scenery.residual_mix);
-            found.z = absent(&found.z, &nothing);
-            (propagated.z, found.z) = known.recognised(&found.z, &lost, &state.z, reach);
+        if let Some(((known, _), reach)) = handover {
+            found.z = absent(&found.z, &known.nothing_at(&found.z, mu_mix));
+            (propagated.z, found.z) = known.recognised(&found.z, &seen, reach);
         }
         found
     }
