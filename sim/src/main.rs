@@ -47,7 +47,7 @@ enum Command {
 
 #[derive(Debug, Args)]
 struct Generate {
-    /// push1, roll, roll-cycle, push2, balls3, balls6 or balls9.
+    /// push1, push1-play, roll, roll-cycle, push2, balls3, balls6 or balls9.
     #[arg(long)]
     scene: Scene,
     /// Episodes that the data set shall have; those it has already are kept.
@@ -99,7 +99,7 @@ struct Hashes {
 
 #[derive(Debug, Args)]
 struct Serve {
-    /// push1, roll, roll-cycle, push2, balls3, balls6 or balls9.
+    /// push1, push1-play, roll, roll-cycle, push2, balls3, balls6 or balls9.
     #[arg(long)]
     scene: Scene,
     /// Height and width of the frames in pixels.

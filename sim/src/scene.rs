@@ -15,6 +15,8 @@ use crate::{
 pub enum Scene {
     /// A Panda pushes three to five cubes and cylinders with joint velocities.
     Push1,
+    /// The same with an arm that plays: it pushes objects from every side, and moves about near them.
+    Push1Play,
     /// A Panda strikes two to four nearly elastic balls that roll for long.
     Roll,
     /// The same with an arm that goes around between four places, whatever lies there.
@@ -61,8 +63,9 @@ pub struct ActionSpec {
 
 impl Scene {
     /// All scenes.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Push1,
+        Self::Push1Play,
         Self::Roll,
         Self::RollCycle,
         Self::Push2,
@@ -75,6 +78,7 @@ impl Scene {
     pub fn name(self) -> &'static str {
         match self {
             Self::Push1 => "push1",
+            Self::Push1Play => "push1-play",
             Self::Roll => "roll",
             Self::RollCycle => "roll-cycle",
             Self::Push2 => "push2",
@@ -163,7 +167,7 @@ mod tests {
         let error = "push3".parse::<Scene>().unwrap_err().to_string();
         assert_eq!(
             error,
-            "there is no scene `push3`; there are push1, roll, roll-cycle, push2, balls3, balls6, balls9"
+            "there is no scene `push3`; there are push1, push1-play, roll, roll-cycle, push2, balls3, balls6, balls9"
         );
     }
 

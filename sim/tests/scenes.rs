@@ -76,6 +76,11 @@ fn a_panda_pushes() {
 }
 
 #[test]
+fn a_panda_plays() {
+    check_robot_scene(Scene::Push1Play, 3);
+}
+
+#[test]
 fn a_panda_strikes_balls() {
     check_robot_scene(Scene::Roll, 3);
 }

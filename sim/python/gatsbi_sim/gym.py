@@ -16,7 +16,7 @@ import numpy as np
 
 from gatsbi_sim import Simulator
 
-SCENES = ("push1", "roll", "roll-cycle", "push2", "balls3", "balls6", "balls9")
+SCENES = ("push1", "push1-play", "roll", "roll-cycle", "push2", "balls3", "balls6", "balls9")
 
 
 class SimEnv(gymnasium.Env):

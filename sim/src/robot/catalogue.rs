@@ -108,6 +108,8 @@ pub(crate) struct Script {
 pub(crate) enum Aim {
     /// A random object. A push goes on behind its centre so far, least and most.
     Objects { sweep: [f64; 2] },
+    /// A random object, from any side and not always through its middle, or a random place near one.
+    Play { sweep: [f64; 2] },
     /// These places of the tray one after the other, each missed by a little (the spread, metres), from a random one on.
     Cycle { places: [[f64; 2]; 4], spread: f64 },
 }
@@ -130,7 +132,7 @@ const COLOURS: [[f64; 3]; 8] = [
     [0.95, 0.40, 0.65],
 ];
 
-static PUSH1: Layout = Layout {
+const PUSH1: Layout = Layout {
     robot: Robot::Panda,
     frames: 40,
     period: 0.2,
@@ -154,6 +156,12 @@ static PUSH1: Layout = Layout {
         speed: [0.16, 0.34],
         aim: Aim::Objects { sweep: [0.08, 0.18] },
     },
+};
+
+/// All that a hand may do to objects, not only what moves them well.
+static PUSH1_PLAY: Layout = Layout {
+    script: Script { speed: [0.05, 0.36], aim: Aim::Play { sweep: [0.0, 0.16] }, ..PUSH1.script },
+    ..PUSH1
 };
 
 const ROLL: Layout = Layout {
@@ -226,6 +234,7 @@ impl Layout {
     pub(crate) fn of(scene: Scene) -> Option<&'static Self> {
         match scene {
             Scene::Push1 => Some(&PUSH1),
+            Scene::Push1Play => Some(&PUSH1_PLAY),
             Scene::Roll => Some(&ROLL),
             Scene::RollCycle => Some(&ROLL_CYCLE),
             Scene::Push2 => Some(&PUSH2),

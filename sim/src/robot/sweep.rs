@@ -4,9 +4,10 @@
 //! objects that are squeezed against the rim would jump out. On its way the hand does not go around objects, so it
 //! touches others too.
 //!
-//! Where the layout says so, the hand goes around between fixed places instead, whatever lies there.
+//! Where the layout says so, it plays instead: it pushes from any side, also past an object's middle, and moves about near
+//! objects. Or it goes around between fixed places, whatever lies there.
 
-use std::collections::VecDeque;
+use std::{collections::VecDeque, f64::consts::TAU};
 
 use nalgebra::{Vector2, Vector3};
 use rand::{RngExt as _, rngs::ChaCha8Rng};
@@ -24,6 +25,12 @@ const CLEARANCE: f64 = 0.07;
 pub(crate) const RIM_MARGIN: f64 = 0.035;
 /// An object that is pushed keeps so many of its half sizes from the rim, besides.
 const RIM_HALF_SIZES: f64 = 2.3;
+/// In play, distance from the object's centre at which a push begins, whatever else lies there; how far beside the centre
+/// it goes, at most; how near to an object the hand moves about, and how often it does that.
+const PLAY_BEHIND: [f64; 2] = [0.06, 0.12];
+const PLAY_BESIDE: f64 = 0.03;
+const PLAY_NEAR: f64 = 0.12;
+const PLAY_ABOUT: f64 = 0.3;
 /// Spread of the direction around the one to the tray's centre, radians, and how it grows from try to try.
 const SPREAD: [f64; 2] = [0.5, 0.02];
 /// Between pushes the hand is faster by this much.
@@ -45,7 +52,7 @@ pub(crate) struct Sweeps {
 impl Sweeps {
     pub(crate) fn new(mut rng: ChaCha8Rng, script: &'static Script, tray: &'static Tray) -> Self {
         let turn = match &script.aim {
-            Aim::Objects { .. } => 0,
+            Aim::Objects { .. } | Aim::Play { .. } => 0,
             Aim::Cycle { places, .. } => rng.random_range(0..places.len()),
         };
         Self { rng, script, tray, ways: VecDeque::new(), turn }
@@ -69,7 +76,15 @@ impl Sweeps {
         while left > 1e-9 {
             let Some(&(goal, speed)) = self.ways.front() else {
                 match &self.script.aim {
-                    Aim::Objects { sweep } => self.plan(hand, objects, half_size, *sweep),
+                    Aim::Objects { sweep } => {
+                        let push = |script: &mut Self, attempt| {
+                            script.push(objects, half_size, *sweep, attempt)
+                        };
+                        self.plan(hand, push);
+                    }
+                    Aim::Play { sweep } => {
+                        self.plan(hand, |script, _| script.play(objects, half_size, *sweep));
+                    }
                     Aim::Cycle { places, spread } => self.go_on(places, *spread),
                 }
                 continue;
@@ -98,8 +113,13 @@ impl Sweeps {
         self.turn = (self.turn + 1) % places.len();
     }
 
-    fn plan(&mut self, hand: Vector3<f64>, objects: &[[f64; 3]], half_size: f64, sweep: [f64; 2]) {
-        let push = (0..TRIES).find_map(|attempt| self.push(objects, half_size, sweep, attempt));
+    /// To the start of a push and to its end; `push` is tried until there is one.
+    fn plan(
+        &mut self,
+        hand: Vector3<f64>,
+        mut push: impl FnMut(&mut Self, usize) -> Option<([f64; 2], [f64; 2])>,
+    ) {
+        let push = (0..TRIES).find_map(|attempt| push(self, attempt));
         let [slow, fast] = self.script.speed;
         let speed = self.rng.random_range(slow..fast);
         let (low, high) = (self.script.height, self.script.travel_height);
@@ -142,10 +162,38 @@ impl Sweeps {
         let clear = objects.iter().all(|other| (flat(other) - start).norm() > CLEARANCE);
         (reachable && forwards && clear).then(|| (start.into(), end.into()))
     }
+
+    /// Start and end of a push in any direction, or of a move near an object.
+    fn play(
+        &mut self,
+        objects: &[[f64; 3]],
+        half_size: f64,
+        [least, most]: [f64; 2],
+    ) -> Option<([f64; 2], [f64; 2])> {
+        let [x, y, _] = objects[self.rng.random_range(0..objects.len())];
+        let object = Vector2::new(x, y);
+        let [start, end] = if self.rng.random_bool(PLAY_ABOUT) {
+            let mut near = |_, _| self.rng.random_range(-PLAY_NEAR..PLAY_NEAR);
+            [(); 2].map(|()| object + Vector2::from_fn(&mut near))
+        } else {
+            let angle = self.rng.random_range(0.0..TAU);
+            let along = Vector2::new(angle.cos(), angle.sin());
+            let across = Vector2::new(-along.y, along.x);
+            let middle = object + across * self.rng.random_range(-PLAY_BESIDE..PLAY_BESIDE);
+            let behind = self.rng.random_range(PLAY_BEHIND[0]..PLAY_BEHIND[1]);
+            let beyond = self.rng.random_range(least..most);
+            [middle - along * behind, middle + along * beyond]
+        };
+        let reachable = start == Vector2::from(self.tray.clamp(start.into(), RIM_MARGIN));
+        let end = self.tray.clamp(end.into(), RIM_MARGIN + RIM_HALF_SIZES * half_size);
+        reachable.then(|| (start.into(), end))
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
     use rand::SeedableRng as _;
 
     use super::*;
@@ -160,7 +208,7 @@ mod tests {
 
     #[test]
     fn the_hand_stays_in_the_tray_and_keeps_its_speed() {
-        for (scene, period) in [(Scene::Push1, 0.2), (Scene::Push2, 0.1)] {
+        for (scene, period) in [(Scene::Push1, 0.2), (Scene::Push1Play, 0.2), (Scene::Push2, 0.1)] {
             let mut sweeps = sweeps(scene, 1);
             let (script, tray) = (sweeps.script, sweeps.tray);
             let mut hand = Vector3::new(0.5, 0.0, script.travel_height);
@@ -181,7 +229,9 @@ mod tests {
         for seed in 0..50 {
             let mut sweeps = sweeps(Scene::Push1, seed);
             let Aim::Objects { sweep } = sweeps.script.aim else { panic!() };
-            sweeps.plan(Vector3::new(0.4, 0.0, 0.03), &OBJECTS, 0.035, sweep);
+            sweeps.plan(Vector3::new(0.4, 0.0, 0.03), |script, attempt| {
+                script.push(&OBJECTS, 0.035, sweep, attempt)
+            });
             let (end, _) = *sweeps.ways.back().unwrap();
             let (start, _) = sweeps.ways[sweeps.ways.len() - 2];
             let margin = RIM_MARGIN + RIM_HALF_SIZES * 0.035;
@@ -195,6 +245,21 @@ mod tests {
             through += usize::from(OBJECTS.iter().any(passes));
         }
         assert!(through >= 48, "{through} of 50 pushes go through an object");
+    }
+
+    #[test]
+    fn play_pushes_from_every_side() {
+        let mut sweeps = sweeps(Scene::Push1Play, 3);
+        let Aim::Play { sweep } = sweeps.script.aim else { panic!() };
+        let object = [[0.52, 0.0, 0.03]];
+        let mut sides = [0; 4];
+        for _ in 0..400 {
+            let Some((start, end)) = sweeps.play(&object, 0.035, sweep) else { continue };
+            let way = Vector2::from(end) - Vector2::from(start);
+            let quarter = (way.y.atan2(way.x) + PI) / FRAC_PI_2;
+            sides[(quarter as usize).min(3)] += 1;
+        }
+        assert!(sides.iter().all(|&pushes| pushes > 60), "{sides:?}");
     }
 
     #[test]
