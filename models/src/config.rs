@@ -61,6 +61,10 @@ pub struct MixtureConfig {
     pub delta: f64,
     /// Whether the prior of a component sees the enhanced action directly.
     pub comp_prior_action: bool,
+    /// Whether posterior and prior remember by the same networks (the integrated RNN of the paper's supplement), instead of
+    /// by ones of their own.
+    #[serde(default)]
+    pub one_memory: bool,
     /// Encoder of frames and of `mu_mix`.
     pub encoder: EncoderConfig,
     /// Mask decoder.

@@ -48,6 +48,7 @@ MODEL: dict[str, Any] = {
         "mask_features": 6,
         "delta": 1.5,
         "comp_prior_action": False,
+        "one_memory": False,
         "encoder": {"channels": [6, 8], "groups": [2, 4], "first_kernel": 5, "features": 9},
         "mask_decoder": {
             "inputs": 5,
@@ -207,6 +208,7 @@ CASES: dict[str, Micro] = {
         changes={
             "mixture": {
                 "slots": 4,
+                "one_memory": True,
                 "comp_norm": "group",
                 "mask_decoder": {"stages": [stage(4, 6, 3), stage(4, 4, 2)]},
                 "comp_decoder": {**SUB_PIXEL, "stages": [stage(2, 6, 3), stage(4, 4, 2)]},

@@ -71,6 +71,7 @@ pub fn tiny() -> GatsbiConfig {
             mask_features: 32,
             delta: 1.0,
             comp_prior_action: false,
+            one_memory: false,
             encoder: EncoderConfig {
                 channels: vec![16, 32, 48, 64],
                 groups: vec![2, 4, 6, 8],
@@ -163,6 +164,7 @@ fn paper(sizes: PaperSizes) -> GatsbiConfig {
             mask_features: 64,
             delta,
             comp_prior_action: false,
+            one_memory: false,
             encoder: EncoderConfig {
                 channels: vec![64, 128, 256, 512],
                 groups: vec![4, 8, 16, 32],

@@ -60,15 +60,17 @@ impl ParamStore {
         self.trainable().map(|(_, tensor)| tensor.numel()).sum()
     }
 
-    /// Takes over the values of all parameters that `other` has under the same name in the same shape; returns the names
-    /// of the others.
-    pub fn take(&mut self, other: &Self) -> Vec<String> {
+    /// Takes over the values of all `wanted` parameters that `other` has under the same name in the same shape; returns the
+    /// names of the others.
+    pub fn take(&mut self, other: &Self, wanted: impl Fn(&str) -> bool) -> Vec<String> {
         let _no_grad = tch::no_grad_guard();
         let mut left = Vec::new();
         for (name, (_, tensor)) in &mut self.entries {
-            match other.get(name).filter(|theirs| theirs.size() == tensor.size()) {
-                Some(theirs) => tensor.copy_(theirs),
-                None => left.push(name.clone()),
+            match other.get(name) {
+                Some(theirs) if theirs.size() == tensor.size() && wanted(name) => {
+                    tensor.copy_(theirs);
+                }
+                _ => left.push(name.clone()),
             }
         }
         left
@@ -282,7 +284,8 @@ mod tests {
         let mut ours = store(1, &[("a", [4, 3]), ("b", [4, 3]), ("c", [2, 2])]);
         let theirs = store(2, &[("a", [4, 3]), ("b", [3, 3]), ("d", [2, 2])]);
         let kept = ours.get("b").unwrap().copy();
-        assert_eq!(ours.take(&theirs), ["b", "c"]);
+        assert_eq!(ours.take(&theirs, |name| name != "a"), ["a", "b", "c"]);
+        assert_eq!(ours.take(&theirs, |_| true), ["b", "c"]);
         assert_eq!(ours.get("a"), theirs.get("a"));
         assert_eq!(ours.get("b"), Some(&kept));
         assert!(ours.get("a").unwrap().requires_grad());

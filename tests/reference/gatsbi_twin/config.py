@@ -76,6 +76,8 @@ class MixtureConfig:
     comp_norm: str
     """`batch` or `group`."""
     init: str
+    one_memory: bool = False
+    """Whether the posterior shares the prior's memory."""
 
 
 @dataclass(frozen=True)

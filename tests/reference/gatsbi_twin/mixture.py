@@ -18,6 +18,8 @@ Memory = tuple[Tensor, Tensor]
 """Hidden and cell state, [B, K, h] each."""
 
 FAMILIES = ("mask_post", "mask_prior", "comp_post", "comp_prior")
+SHARED = {"mask_post": "mask_prior", "comp_post": "comp_prior"}
+"""Whose memory the posterior's is, where there is but one."""
 
 
 @dataclass
@@ -75,6 +77,7 @@ class Mixture(nn.Module):
             {
                 family: MemoryFamily(slots, width + mixture.encoder.features, mixture.hidden)
                 for family, width in zip(FAMILIES, widths, strict=True)
+                if not (mixture.one_memory and family in SHARED)
             }
         )
         self.z_mask_start = nn.Parameter(torch.empty(slots, mixture.z_mask))
@@ -85,7 +88,7 @@ class Mixture(nn.Module):
         return MixtureState(
             self.z_mask_start.expand(batch, -1, -1),
             self.z_comp_start.expand(batch, -1, -1),
-            {family: bank.start.expand(batch) for family, bank in self.memory.items()},
+            self._whole({family: bank.start.expand(batch) for family, bank in self.memory.items()}),
         )
 
     def observe(
@@ -136,7 +139,11 @@ class Mixture(nn.Module):
         slots = step.components.shape[1]
         encoding = self.encoder(step.mu_mix).unsqueeze(1).expand(-1, slots, -1)  # [B, K, e]
         memory = dict(state.memory)
-        for family in families:
+        for family in (family for family in families if family in self.memory):
             z = step.masks.z if family.startswith("mask") else step.comps.z
             memory[family] = self.memory[family](torch.cat([z, encoding], -1), state.memory[family])
-        return MixtureState(step.masks.z, step.comps.z, memory)
+        return MixtureState(step.masks.z, step.comps.z, self._whole(memory))
+
+    def _whole(self, memory: dict[str, Memory]) -> dict[str, Memory]:
+        shared = {post: memory[prior] for post, prior in SHARED.items() if post not in self.memory}
+        return memory | shared

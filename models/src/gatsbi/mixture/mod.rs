@@ -122,6 +122,9 @@ enum Families {
     Prior,
 }
 
+/// LSTMs of one memory, and where it starts.
+type Family = (LstmBank, LearnedState);
+
 /// The mixture module.
 #[derive(Debug)]
 pub struct Mixture {
@@ -130,10 +133,11 @@ pub struct Mixture {
     mask_decoder: MaskDecoder,
     comps: CompPath,
     comp_decoder: CompDecoder,
-    mask_post: (LstmBank, LearnedState),
-    mask_prior: (LstmBank, LearnedState),
-    comp_post: (LstmBank, LearnedState),
-    comp_prior: (LstmBank, LearnedState),
+    /// Absent where the posterior shares the prior's memory.
+    mask_post: Option<Family>,
+    mask_prior: Family,
+    comp_post: Option<Family>,
+    comp_prior: Family,
     z_mask_start: Tensor,
     z_comp_start: Tensor,
     z_mask: i64,
@@ -151,6 +155,7 @@ impl Mixture {
             let bank = LstmBank::new(&path, slots, z + config.encoder.features, hidden);
             (bank, LearnedState::new(&path.sub("start"), &[slots, hidden], config.init))
         };
+        let post = |name: &str, z| (!config.one_memory).then(|| family(name, z));
         let start = |name: &str, z| path.weight(name, &[slots, z], LearnedState::init(config.init));
         let encoder = &path.sub("encoder");
         Self {
@@ -159,9 +164,9 @@ impl Mixture {
             mask_decoder: MaskDecoder::new(&path.sub("mask_decoder"), config, action, image_size),
             comps: CompPath::new(&path.sub("comp"), config, action, image_size),
             comp_decoder: CompDecoder::new(&path.sub("comp_decoder"), config, action, image_size),
-            mask_post: family("mask_post", config.z_mask),
+            mask_post: post("mask_post", config.z_mask),
             mask_prior: family("mask_prior", config.z_mask),
-            comp_post: family("comp_post", config.z_comp),
+            comp_post: post("comp_post", config.z_comp),
             comp_prior: family("comp_prior", config.z_comp),
             z_mask_start: start("z_mask_start", config.z_mask),
             z_comp_start: start("z_comp_start", config.z_comp),
@@ -173,17 +178,18 @@ impl Mixture {
 
     /// The learned state before any frame.
     pub fn initial_state(&self, batch: i64) -> MixtureState {
-        let memory = |(_, start): &(LstmBank, LearnedState)| {
+        let memory = |(_, start): &Family| {
             let (h, c) = start.expand(batch);
             Memory { h, c }
         };
+        let post = |post: &Option<Family>, prior| memory(post.as_ref().unwrap_or(prior));
         let latent = |start: &Tensor| start.unsqueeze(0).expand([batch, -1, -1], false);
         MixtureState {
             z_mask: latent(&self.z_mask_start),
             z_comp: latent(&self.z_comp_start),
-            mask_post: memory(&self.mask_post),
+            mask_post: post(&self.mask_post, &self.mask_prior),
             mask_prior: memory(&self.mask_prior),
-            comp_post: memory(&self.comp_post),
+            comp_post: post(&self.comp_post, &self.comp_prior),
             comp_prior: memory(&self.comp_prior),
         }
     }
@@ -313,23 +319,25 @@ impl Mixture {
         let encoding = self.encoder.forward(&mu_mix).unsqueeze(1); // [B, 1, e]
         let encodings = encoding.expand([-1, masks.z.size()[1], -1], false);
         let inputs = |z: &Tensor| Tensor::cat(&[z, &encodings], -1);
-        let advance = |(bank, _): &(LstmBank, LearnedState), input: &Tensor, memory: &Memory| {
+        let advance = |(bank, _): &Family, input: &Tensor, memory: &Memory| {
             let (h, c) = bank.forward(input, (&memory.h, &memory.c));
             Memory { h, c }
         };
-        let (mask_input, comp_input) = (inputs(&masks.z), inputs(&comps.z));
-        let (mask_post, comp_post) = match families {
-            Families::Both => (
-                advance(&self.mask_post, &mask_input, &state.mask_post),
-                advance(&self.comp_post, &comp_input, &state.comp_post),
-            ),
-            Families::Prior => (state.mask_post.shallow_clone(), state.comp_post.shallow_clone()),
+        let post = |post: &Option<Family>, input: &Tensor, memory: &Memory, prior: &Memory| match (
+            post, families,
+        ) {
+            (None, _) => prior.shallow_clone(),
+            (Some(family), Families::Both) => advance(family, input, memory),
+            (Some(_), Families::Prior) => memory.shallow_clone(),
         };
+        let (mask_input, comp_input) = (inputs(&masks.z), inputs(&comps.z));
+        let mask_prior = advance(&self.mask_prior, &mask_input, &state.mask_prior);
+        let comp_prior = advance(&self.comp_prior, &comp_input, &state.comp_prior);
         let next = MixtureState {
-            mask_post,
-            mask_prior: advance(&self.mask_prior, &mask_input, &state.mask_prior),
-            comp_post,
-            comp_prior: advance(&self.comp_prior, &comp_input, &state.comp_prior),
+            mask_post: post(&self.mask_post, &mask_input, &state.mask_post, &mask_prior),
+            comp_post: post(&self.comp_post, &comp_input, &state.comp_post, &comp_prior),
+            mask_prior,
+            comp_prior,
             z_mask: masks.z,
             z_comp: comps.z,
         };
@@ -359,4 +367,40 @@ fn mix(log_masks: &Tensor, components: &Tensor) -> Tensor {
 fn shape(state: &MixtureState, width: i64) -> [i64; 3] {
     let size = state.z_mask.size();
     [size[0], size[1], width]
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::{Device, Kind, Tensor};
+
+    use super::Mixture;
+    use crate::{config::presets, nn::ParamStore, noise::PhiloxNoise};
+
+    #[test]
+    fn one_memory_serves_posterior_and_prior() {
+        for one_memory in [true, false] {
+            let mut config = presets::tiny();
+            config.mixture.one_memory = one_memory;
+            let mut store = ParamStore::new(3, Device::Cpu);
+            let mixture = store.build(|root| {
+                let path = root.sub("mixture");
+                Mixture::new(&path, &config.mixture, config.action.enhanced, config.image_size)
+            });
+            let _no_grad = tch::no_grad_guard();
+            let options = (Kind::Float, Device::Cpu);
+            let (frame, action) =
+                (Tensor::rand([1, 3, 64, 64], options), Tensor::zeros([1, 16], options));
+            let (noise, first) = (PhiloxNoise::mean(1, Device::Cpu), Tensor::from_slice(&[true]));
+            let state = mixture.initial_state(1);
+            let (seen, _) = mixture.observe(&state, &frame, &action, &first, &noise, false, false);
+            let (imagined, _) = mixture.imagine(&seen, &action, &first.logical_not(), &noise);
+            let same = |a: &Tensor, b: &Tensor| a.equal(b);
+            for state in [&state, &seen, &imagined] {
+                assert_eq!(same(&state.mask_post.h, &state.mask_prior.h), one_memory);
+                assert_eq!(same(&state.comp_post.c, &state.comp_prior.c), one_memory);
+            }
+            // A posterior with a memory of its own is not told of what is only imagined.
+            assert_eq!(same(&imagined.mask_post.h, &seen.mask_post.h), !one_memory);
+        }
+    }
 }
