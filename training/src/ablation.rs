@@ -1,6 +1,6 @@
 //! Ablations: variants of one recipe, each trained on the same data for the same steps and measured the same way.
 
-use std::{ops::Range, path::Path};
+use std::{collections::BTreeSet, ops::Range, path::Path};
 
 use gatsbi_episodes::Dataset;
 use gatsbi_models::gatsbi::world::GatsbiWorld;
@@ -15,12 +15,14 @@ use crate::{
 };
 
 /// Columns of the table: a number of the report, and its heading.
-const COLUMNS: [(&str, &str); 7] = [
+const COLUMNS: [(&str, &str); 9] = [
     ("psnr_imagined", "PSNR, dB"),
     ("psnr_gain_over_copy_db", "above copy, dB"),
     ("agent_iou_imagined", "agent IoU"),
     ("object_recall_imagined", "recall"),
     ("object_precision_imagined", "precision"),
+    ("moved_object_px_imagined", "moved objects, px"),
+    ("moved_object_way_imagined", "share of way"),
     ("object_px_before_interaction", "px before contact"),
     ("object_px_after_interaction", "px after contact"),
 ];
@@ -38,7 +40,7 @@ pub struct Ablation<'a> {
     pub data: &'a str,
     /// Seed of each run.
     pub seed: u64,
-    /// Checkpoint whose weights each run starts from, as far as it has them.
+    /// Checkpoint whose weights each run starts from, as far as it and all variants have them: none knows more than another.
     pub from: Option<&'a Path>,
     /// Where they compute.
     pub device: Device,
@@ -49,17 +51,35 @@ pub struct Ablation<'a> {
 }
 
 impl Ablation<'_> {
-    /// Trains a variant in `folder`, from where it stopped, and measures it.
+    /// Trains each variant in a folder of `out` with its name, from where it stopped, and measures it. `told` is given what
+    /// is measured so far.
     ///
     /// # Errors
-    /// If the recipe has nothing for the variant to change, training fails, or files cannot be read or written.
-    pub fn measure(&self, variant: Variant, folder: &Path) -> anyhow::Result<Report> {
-        let recipe = variant.of(self.recipe, self.steps)?;
-        let mut trainer =
-            Trainer::open(recipe, self.clips, self.data, self.seed, folder, self.device)?;
-        if let Some(from) = self.from {
-            trainer.start_from(from)?;
+    /// If the recipe has nothing for a variant to change, training fails, or files cannot be read or written.
+    pub fn measure(
+        &self,
+        variants: &[Variant],
+        out: &Path,
+        mut told: impl FnMut(&[(Variant, Report)]) -> anyhow::Result<()>,
+    ) -> anyhow::Result<Vec<(Variant, Report)>> {
+        let open = |variant: &Variant| {
+            let (recipe, folder) = (variant.of(self.recipe, self.steps)?, out.join(variant.name()));
+            Trainer::open(recipe, self.clips, self.data, self.seed, &folder, self.device)
+        };
+        let mut trainers: Vec<Trainer> = variants.iter().map(open).collect::<Result<_, _>>()?;
+        let common = common(&trainers);
+        let mut measured = Vec::new();
+        for (variant, trainer) in variants.iter().zip(&mut trainers) {
+            if let Some(from) = self.from {
+                trainer.start_from(from, |name| common.contains(name))?;
+            }
+            measured.push((*variant, self.measured(trainer, &out.join(variant.name()))?));
+            told(&measured)?;
         }
+        Ok(measured)
+    }
+
+    fn measured(&self, trainer: &mut Trainer, folder: &Path) -> anyhow::Result<Report> {
         trainer.run(self.clips, None)?;
         let world = GatsbiWorld::load(&trainer.checkpoint_path(), self.device)?;
         let protocol = Protocol { horizon: self.horizon, samples: 0, perceptual: None };
@@ -68,6 +88,18 @@ impl Ablation<'_> {
         fs_err::write(folder.join("eval.json"), serde_json::to_string_pretty(&report)?)?;
         Ok(report)
     }
+}
+
+/// Names of the parameters that all runs have in the same shape.
+fn common(trainers: &[Trainer]) -> BTreeSet<String> {
+    let has = |trainer: &Trainer, name: &str, shape: &[i64]| {
+        trainer.parameters().get(name).is_some_and(|tensor| tensor.size() == shape)
+    };
+    let first = trainers.first().into_iter().flat_map(|trainer| trainer.parameters().iter());
+    first
+        .filter(|(name, _, tensor)| trainers.iter().all(|other| has(other, name, &tensor.size())))
+        .map(|(name, _, _)| name.to_owned())
+        .collect()
 }
 
 /// The table of measured variants in Markdown: means with half the width of their 95 % intervals over episodes.

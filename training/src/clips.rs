@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, ensure};
 use gatsbi_episodes::Dataset;
 use gatsbi_models::{noise::philox4x32_10, world_model::ActionDimension};
 use tch::{Device, Kind, Tensor};
@@ -66,8 +66,15 @@ pub struct Batch {
 }
 
 impl Clips {
-    /// Reads the episodes `range` of a data set.
-    pub fn read(dataset: &Dataset, range: Range<usize>) -> anyhow::Result<Self> {
+    /// Reads the episodes `range` of a data set. Its actions are scaled as they are told, else by their own spread.
+    ///
+    /// # Errors
+    /// If an episode cannot be read, or the data set's actions are not those that are told.
+    pub fn read(
+        dataset: &Dataset,
+        range: Range<usize>,
+        scaling: Option<&[ActionDimension]>,
+    ) -> anyhow::Result<Self> {
         let info = dataset.info();
         let (height, width) = (i64::from(info.height), i64::from(info.width));
         let mut read = Vec::new();
@@ -111,6 +118,25 @@ impl Clips {
                 scale: if *std > 1e-6 { f64::from(*std) } else { 1.0 },
             })
             .collect();
+        let actions = match scaling {
+            None => actions,
+            Some(told) => {
+                let names = |actions: &[ActionDimension]| -> Vec<String> {
+                    actions
+                        .iter()
+                        .map(|action| format!("{} ({})", action.name, action.unit))
+                        .collect()
+                };
+                let (found, expected) = (names(&actions), names(told));
+                ensure!(
+                    found == expected,
+                    "the data set's actions are {}, expected those of the checkpoint: {}",
+                    found.join(", "),
+                    expected.join(", ")
+                );
+                told.to_vec()
+            }
+        };
         let scale: Vec<f32> = actions.iter().map(|action| action.scale as f32).collect();
         Ok(Self {
             episodes,

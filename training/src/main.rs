@@ -111,7 +111,7 @@ enum Command {
         /// Folder: a run per variant, and table.md.
         #[arg(long)]
         out: PathBuf,
-        /// Checkpoint whose weights every variant starts from, as far as it has them.
+        /// Checkpoint whose weights every variant starts from, as far as it and all of them have them.
         #[arg(long)]
         from: Option<PathBuf>,
         /// Where to train: cpu, or cuda:N.
@@ -176,11 +176,11 @@ fn main() -> anyhow::Result<()> {
             let recipe = Recipe::load(&recipe)?;
             let dataset = Dataset::open(&episodes)?;
             let range = episodes_in(&dataset, range)?;
-            let clips = Clips::read(&dataset, range.clone())?;
+            let clips = clips(&dataset, range.clone(), from.as_deref())?;
             let data = data_name(&dataset, &range);
             let mut trainer = Trainer::open(recipe, &clips, &data, seed, &out, device)?;
             if let Some(from) = from {
-                trainer.start_from(&from)?;
+                trainer.start_from(&from, |_| true)?;
             }
             trainer.run(&clips, None)?;
         }
@@ -206,7 +206,7 @@ fn main() -> anyhow::Result<()> {
                 "variants are trained on {range:?} and measured on {test:?}, expected no episode \
                  in both"
             );
-            let clips = Clips::read(&dataset, range.clone())?;
+            let clips = clips(&dataset, range.clone(), from.as_deref())?;
             let data = data_name(&dataset, &range);
             let ablation = Ablation {
                 recipe: &recipe,
@@ -219,12 +219,9 @@ fn main() -> anyhow::Result<()> {
                 test: (&dataset, test),
                 horizon: HORIZON,
             };
-            let mut measured = Vec::new();
-            for variant in variants {
-                let report = ablation.measure(variant, &out.join(variant.name()))?;
-                measured.push((variant, report));
-                fs_err::write(out.join("table.md"), ablation::table(&measured))?;
-            }
+            let measured = ablation.measure(&variants, &out, |measured| {
+                Ok(fs_err::write(out.join("table.md"), ablation::table(measured))?)
+            })?;
             print!("{}", ablation::table(&measured));
         }
         Command::Eval { checkpoint, episodes, range, evaluation } => {
@@ -242,6 +239,12 @@ fn device(text: &str) -> Result<Device, String> {
         (_, Some(Ok(_))) => Err("this libtorch sees no CUDA device".to_owned()),
         _ => Err("expected cpu or cuda:N".to_owned()),
     }
+}
+
+/// Reads what is trained on, with actions scaled as the checkpoint that a run starts from takes them.
+fn clips(dataset: &Dataset, range: Range<usize>, from: Option<&Path>) -> anyhow::Result<Clips> {
+    let from = from.map(|path| Checkpoint::load(path, Device::Cpu)).transpose()?;
+    Clips::read(dataset, range, from.as_ref().map(|from| from.header.actions.as_slice()))
 }
 
 fn data_name(dataset: &Dataset, range: &Range<usize>) -> String {

@@ -6,7 +6,7 @@
 use std::{collections::HashMap, path::Path};
 
 use anyhow::{Context as _, bail, ensure};
-use gatsbi_models::{checkpoint::write_atomically, nn::ParamStore};
+use gatsbi_models::{checkpoint::write_atomically, nn::ParamStore, world_model::ActionDimension};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 use tch::{Device, Kind, Tensor};
@@ -31,6 +31,8 @@ pub struct Progress {
     pub recipe: Recipe,
     /// Name and SHA-256 or shape of the data, for telling another data set apart.
     pub data: String,
+    /// How its actions are scaled.
+    pub actions: Vec<ActionDimension>,
 }
 
 /// Writes weights, moments and progress.

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, bail, ensure};
 use gatsbi_models::{
     checkpoint::{self, AgentSlot, Checkpoint, Header, Precision, Provenance},
-    config::{GatsbiConfig, ObjectConfig, presets},
+    config::{GatsbiConfig, MixtureConfig, ObjectConfig, presets},
     gatsbi::{
         keypoint::KeypointLearning,
         model::{Gatsbi, GradientStops, Observing},
@@ -125,6 +125,7 @@ impl Trainer {
                 skipped: 0,
                 recipe: recipe.clone(),
                 data: data.to_owned(),
+                actions: clips.actions.clone(),
             },
             recipe,
             device,
@@ -141,11 +142,12 @@ impl Trainer {
     }
 
     /// Starts from the weights of a checkpoint, if the run has not begun. An architecture that differs from the checkpoint's
-    /// in how objects meet each other and the agent takes what both have; the rest starts untrained.
+    /// in how objects meet each other and the agent, or in its memories, takes what both have and is `wanted`; the rest
+    /// starts untrained.
     ///
     /// # Errors
     /// If the checkpoint cannot be read or its architecture differs in anything else.
-    pub fn start_from(&mut self, path: &Path) -> anyhow::Result<()> {
+    pub fn start_from(&mut self, path: &Path, wanted: impl Fn(&str) -> bool) -> anyhow::Result<()> {
         if self.progress.step > 0 {
             return Ok(());
         }
@@ -161,17 +163,31 @@ impl Trainer {
                 graph: ours.objects.graph,
                 ..loaded.header.model.objects.clone()
             },
+            mixture: MixtureConfig {
+                one_memory: ours.mixture.one_memory,
+                ..loaded.header.model.mixture.clone()
+            },
             tracking: ours.tracking,
             ..loaded.header.model.clone()
         };
         ensure!(theirs == *ours, "{} has another architecture", path.display());
+        ensure!(
+            loaded.header.actions == self.checkpoint.header.actions,
+            "the episodes' actions are not scaled as {} takes them",
+            path.display()
+        );
         self.recipe.prefit = None;
         let header = self.checkpoint.header.clone();
         let header = Header { agent_slot: loaded.header.agent_slot, ..header };
         self.checkpoint = Checkpoint::untrained(header, self.device);
-        self.untrained = self.checkpoint.store.take(&loaded.store);
+        self.untrained = self.checkpoint.store.take(&loaded.store, wanted);
         self.seeing = (!self.untrained.is_empty()).then_some(loaded.model);
         Ok(())
+    }
+
+    /// Parameters of the model.
+    pub fn parameters(&self) -> &ParamStore {
+        &self.checkpoint.store
     }
 
     /// Steps taken.
@@ -316,6 +332,11 @@ impl Trainer {
         let Progress { seed, data, recipe, .. } = &saved;
         ensure!(*seed == self.progress.seed, "{} has seed {seed}", path.display());
         ensure!(*data == self.progress.data, "{} is a run on {data}", path.display());
+        ensure!(
+            saved.actions == self.progress.actions,
+            "{} scales actions otherwise; a run that was begun with --from goes on with it",
+            path.display()
+        );
         ensure!(
             (&recipe.model, recipe.variant, recipe.batch)
                 == (&self.recipe.model, self.recipe.variant, self.recipe.batch),

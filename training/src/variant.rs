@@ -42,6 +42,8 @@ pub enum Variant {
     Knn3,
     /// Objects see their five nearest neighbours.
     Knn5,
+    /// Posterior and prior of the mixture share their memories (the paper's integrated RNN).
+    OneMemory,
     /// The agent moves objects one step late, as in the original.
     AgentCurrent,
     /// The agent moves objects in the same step.
@@ -71,6 +73,7 @@ impl Variant {
             Self::Inter1 => *interaction = Interaction::Inter1,
             Self::Inter2 => *interaction = Interaction::Inter2 { outputs, celu: false },
             Self::Inter3 => *interaction = Interaction::Inter3 { outputs, celu: false },
+            Self::OneMemory => model.mixture.one_memory = true,
             Self::Fc => *graph = Graph::FullyConnected,
             Self::Knn3 => *graph = knn(3),
             Self::Knn5 => *graph = knn(5),

@@ -33,7 +33,8 @@ fn sample(name: &str) -> Dataset {
 }
 
 fn heldout() -> Clips {
-    Clips::read(&sample("push1"), 0..2).unwrap()
+    let actions = bundled("push1-tiny").header.actions;
+    Clips::read(&sample("push1"), 0..2, Some(&actions)).unwrap()
 }
 
 #[test]

@@ -96,7 +96,7 @@ fn check(recipe: &str, sample: &str) {
     tch::set_num_threads(1);
     let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../episodes/samples");
     let dataset = Dataset::open(samples.join(sample)).unwrap();
-    let clips = Clips::read(&dataset, 0..dataset.len().min(2)).unwrap();
+    let clips = Clips::read(&dataset, 0..dataset.len().min(2), None).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let run = |name: &str, stops: &[u64]| trained(recipe, &clips, &folder.path().join(name), stops);
     let once = run("once", &[STEPS]);
@@ -104,6 +104,32 @@ fn check(recipe: &str, sample: &str) {
     assert!(once == resumed, "the resumed run ended with other weights");
     let other = run("other", &[STEPS - 1]);
     assert!(once != other, "the last step changed nothing");
+}
+
+#[test]
+fn a_run_that_goes_on_from_a_checkpoint_takes_actions_as_it_does() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let dataset = Dataset::open(folder.join("../episodes/samples/push1-heldout.parquet")).unwrap();
+    let from = folder.join("../models/checkpoints/push1-tiny.safetensors");
+    let theirs = Checkpoint::load(&from, Device::Cpu).unwrap().header.actions;
+    let recipe: Recipe = toml::from_str(RECIPE).unwrap();
+    let open = |clips: &Clips, name: &str| {
+        let out = tempfile::tempdir().unwrap();
+        let mut trainer =
+            Trainer::open(recipe.clone(), clips, name, 7, out.path(), Device::Cpu).unwrap();
+        trainer.start_from(&from, |_| true)
+    };
+    let own = Clips::read(&dataset, 0..2, None).unwrap();
+    let refused = open(&own, "own").unwrap_err().to_string();
+    assert!(refused.contains("actions are not scaled as"), "{refused}");
+    let told = Clips::read(&dataset, 0..2, Some(&theirs)).unwrap();
+    assert_eq!(told.actions, theirs);
+    open(&told, "told").unwrap();
+
+    let mut others = theirs;
+    others[0].name = "wheel".into();
+    let refused = Clips::read(&dataset, 0..2, Some(&others)).unwrap_err().to_string();
+    assert!(refused.contains("expected those of the checkpoint: wheel"), "{refused}");
 }
 
 #[test]
