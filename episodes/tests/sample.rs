@@ -50,3 +50,21 @@ fn the_sample_of_balls_is_what_its_readme_says() {
     assert!(labels.iter().all(|&label| label == 0 || (2..8).contains(&label)));
     assert!(episode.data().contacts_objects.as_ref().unwrap().contains(&1));
 }
+
+#[test]
+fn the_sample_of_rolling_balls_is_what_its_readme_says() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/roll-heldout.parquet");
+    let dataset = Dataset::open(path).unwrap();
+    let info = dataset.info();
+    assert_eq!((info.name.as_str(), info.height, info.width), ("roll", 64, 64));
+    assert_eq!((info.frame_period_seconds, info.action_dimension()), (0.15, 7));
+    let mut counts = vec![];
+    for (index, id) in [318, 319].into_iter().enumerate() {
+        let episode = dataset.read(index).unwrap();
+        assert_eq!((episode.id(), episode.length()), (id, 40));
+        assert!(episode.data().contacts_agent.as_ref().unwrap().contains(&1));
+        counts.push(episode.object_count().unwrap());
+    }
+    counts.sort_unstable();
+    assert_eq!(counts, [2, 3]);
+}

@@ -15,7 +15,7 @@ use crate::{
 pub enum Scene {
     /// A Panda pushes three to five cubes and cylinders with joint velocities.
     Push1,
-    /// The same with an arm that plays: it pushes objects from every side, and moves about near them.
+    /// The same with an arm that plays: it pushes objects from every side, and wanders into them.
     Push1Play,
     /// A Panda strikes two to four nearly elastic balls that roll for long.
     Roll,

@@ -4,8 +4,8 @@
 //! objects that are squeezed against the rim would jump out. On its way the hand does not go around objects, so it
 //! touches others too.
 //!
-//! Where the layout says so, it plays instead: it pushes from any side, also past an object's middle, and moves about near
-//! objects. Or it goes around between fixed places, whatever lies there.
+//! Where the layout says so, it plays instead: it pushes from any side, also past an object's middle, and wanders into
+//! objects as a planner's candidates do. Or it goes around between fixed places, whatever lies there.
 
 use std::{collections::VecDeque, f64::consts::TAU};
 
@@ -26,11 +26,19 @@ pub(crate) const RIM_MARGIN: f64 = 0.035;
 /// An object that is pushed keeps so many of its half sizes from the rim, besides.
 const RIM_HALF_SIZES: f64 = 2.3;
 /// In play, distance from the object's centre at which a push begins, whatever else lies there; how far beside the centre
-/// it goes, at most; how near to an object the hand moves about, and how often it does that.
+/// it goes, at most.
 const PLAY_BEHIND: [f64; 2] = [0.06, 0.12];
 const PLAY_BESIDE: f64 = 0.03;
-const PLAY_NEAR: f64 = 0.12;
-const PLAY_ABOUT: f64 = 0.3;
+/// How often the hand wanders instead, for how many frames, the spread and the greatest of its moves along an axis in one,
+/// metres, and by how much more of the spread it turns from frame to frame.
+const WANDER_OFTEN: f64 = 0.75;
+const WANDER_FRAMES: usize = 5;
+const WANDER_SPREAD: f64 = 0.042;
+const WANDER_MOST: f64 = 0.06;
+const WANDER_TURN: f64 = 0.4;
+/// It touches an object whose centre comes this near to its way; most ways do.
+const WANDER_TOUCH: f64 = 0.045;
+const WANDER_TRIES: usize = 20;
 /// Spread of the direction around the one to the tray's centre, radians, and how it grows from try to try.
 const SPREAD: [f64; 2] = [0.5, 0.02];
 /// Between pushes the hand is faster by this much.
@@ -81,6 +89,9 @@ impl Sweeps {
                             script.push(objects, half_size, *sweep, attempt)
                         };
                         self.plan(hand, push);
+                    }
+                    Aim::Play { .. } if self.rng.random_bool(WANDER_OFTEN) => {
+                        self.wander(hand, objects, half_size, period);
                     }
                     Aim::Play { sweep } => {
                         self.plan(hand, |script, _| script.play(objects, half_size, *sweep));
@@ -163,7 +174,7 @@ impl Sweeps {
         (reachable && forwards && clear).then(|| (start.into(), end.into()))
     }
 
-    /// Start and end of a push in any direction, or of a move near an object.
+    /// Start and end of a push in any direction.
     fn play(
         &mut self,
         objects: &[[f64; 3]],
@@ -172,21 +183,49 @@ impl Sweeps {
     ) -> Option<([f64; 2], [f64; 2])> {
         let [x, y, _] = objects[self.rng.random_range(0..objects.len())];
         let object = Vector2::new(x, y);
-        let [start, end] = if self.rng.random_bool(PLAY_ABOUT) {
-            let mut near = |_, _| self.rng.random_range(-PLAY_NEAR..PLAY_NEAR);
-            [(); 2].map(|()| object + Vector2::from_fn(&mut near))
-        } else {
-            let angle = self.rng.random_range(0.0..TAU);
-            let along = Vector2::new(angle.cos(), angle.sin());
-            let across = Vector2::new(-along.y, along.x);
-            let middle = object + across * self.rng.random_range(-PLAY_BESIDE..PLAY_BESIDE);
-            let behind = self.rng.random_range(PLAY_BEHIND[0]..PLAY_BEHIND[1]);
-            let beyond = self.rng.random_range(least..most);
-            [middle - along * behind, middle + along * beyond]
-        };
+        let angle = self.rng.random_range(0.0..TAU);
+        let along = Vector2::new(angle.cos(), angle.sin());
+        let across = Vector2::new(-along.y, along.x);
+        let middle = object + across * self.rng.random_range(-PLAY_BESIDE..PLAY_BESIDE);
+        let start = middle - along * self.rng.random_range(PLAY_BEHIND[0]..PLAY_BEHIND[1]);
+        let end = middle + along * self.rng.random_range(least..most);
         let reachable = start == Vector2::from(self.tray.clamp(start.into(), RIM_MARGIN));
         let end = self.tray.clamp(end.into(), RIM_MARGIN + RIM_HALF_SIZES * half_size);
         reachable.then(|| (start.into(), end))
+    }
+
+    /// Some frames of moves that turn slowly, preferably into an object.
+    fn wander(&mut self, hand: Vector3<f64>, objects: &[[f64; 3]], half_size: f64, period: f64) {
+        let mut way = vec![];
+        for _ in 0..WANDER_TRIES {
+            way = self.moves(hand.xy(), RIM_MARGIN + half_size);
+            let touches = |object: &[f64; 3]| {
+                way.iter().any(|at| (at - Vector2::new(object[0], object[1])).norm() < WANDER_TOUCH)
+            };
+            if objects.iter().any(touches) {
+                break;
+            }
+        }
+        let mut from = hand.xy();
+        for at in way {
+            let speed = ((at - from).norm() / period).max(self.script.speed[0]);
+            self.ways.push_back((Vector3::new(at.x, at.y, self.script.height), speed));
+            from = at;
+        }
+    }
+
+    /// Where moves that turn slowly lead from a place.
+    fn moves(&mut self, mut at: Vector2<f64>, margin: f64) -> Vec<Vector2<f64>> {
+        let tray = self.tray;
+        let mut draw = || Vector2::new(self.jitter(WANDER_SPREAD), self.jitter(WANDER_SPREAD));
+        let mut step = draw();
+        let mut one = || {
+            at += step.map(|part| part.clamp(-WANDER_MOST, WANDER_MOST));
+            at = Vector2::from(tray.clamp(at.into(), margin));
+            step += draw() * WANDER_TURN;
+            at
+        };
+        (0..WANDER_FRAMES).map(|_| one()).collect()
     }
 }
 
