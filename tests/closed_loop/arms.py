@@ -19,7 +19,7 @@ from search import Array, Budget, Icem
 
 REACH = 0.06
 """Largest displacement of the hand in a step, metres; the data sets' pushes reach 0.068."""
-HAND_WEIGHT = 3.0
+HAND_WEIGHT = 1.0
 """How much it counts, a metre, that the hand is not behind the object yet."""
 LAST_WEIGHT = 2.0
 """How much the last step counts beside the mean of all."""

@@ -118,3 +118,18 @@ fn balls_are_found_and_foreseen() {
     let gain = numbers["psnr_gain_over_copy_db"];
     assert!(gain > 1.0, "imagination is {gain} dB better than the last frame");
 }
+
+#[test]
+fn an_arm_that_strikes_balls_is_foreseen_and_resting_balls_are_found() {
+    let world = GatsbiWorld::new(bundled("roll-tiny"));
+    let protocol = Protocol { horizon: 15, samples: 0, perceptual: None };
+    let numbers = report(&world, &sample("roll"), 0..2, protocol, |_| {}).unwrap().numbers;
+    for (name, least) in [
+        ("agent_iou_observed", 0.6),
+        ("agent_iou_imagined", 0.5),
+        ("object_precision", 0.8),
+        ("psnr_gain_over_copy_db", 2.0),
+    ] {
+        assert!(numbers[name] > least, "{name} is {}", numbers[name]);
+    }
+}
