@@ -35,7 +35,10 @@ class Observation:
 
 
 class Simulator:
-    """One scene: push1, push1-play, roll, roll-cycle, push2, balls3, balls6 or balls9. A request that is refused changes nothing."""
+    """One scene: push1, push1-play, roll, roll-cycle, push2, balls3, balls6 or balls9.
+
+    A request that is refused changes nothing.
+    """
 
     def __init__(self, scene, *, size=64, program=None):
         """Starts the program: `program`, else the environment variable GATSBI_SIM, else `gatsbi-sim` of the path."""

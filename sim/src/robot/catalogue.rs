@@ -108,7 +108,7 @@ pub(crate) struct Script {
 pub(crate) enum Aim {
     /// A random object. A push goes on behind its centre so far, least and most.
     Objects { sweep: [f64; 2] },
-    /// A random object, from any side and not always through its middle, or a random place near one.
+    /// A random object, from any side and not always through its middle; or it wanders, preferably into one.
     Play { sweep: [f64; 2] },
     /// These places of the tray one after the other, each missed by a little (the spread, metres), from a random one on.
     Cycle { places: [[f64; 2]; 4], spread: f64 },
