@@ -1,4 +1,4 @@
-//! `gatsbi-episodes`: imports, exports, inspects and splits data sets from the command line.
+//! `gatsbi-episodes`: imports, exports, inspects, splits and joins data sets from the command line.
 
 use std::{
     io::{self, IsTerminal as _, Write as _},
@@ -8,7 +8,9 @@ use std::{
 
 use anyhow::{Context as _, bail, ensure};
 use clap::{Args, Parser, Subcommand};
-use gatsbi_episodes::{Dataset, Manifest, WriterOptions, write_whole};
+use gatsbi_episodes::{
+    Dataset, DatasetInfo, Episode, EpisodeData, Error, Manifest, WriterOptions, write_whole,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 
 mod report;
@@ -17,7 +19,7 @@ mod transfer;
 use report::Report;
 use transfer::{Export, Import};
 
-/// Robot episodes in Parquet files: import, export, inspect, split.
+/// Robot episodes in Parquet files: import, export, inspect, split, join.
 #[derive(Debug, Parser)]
 #[command(version)]
 struct Cli {
@@ -37,6 +39,8 @@ enum Command {
     Info(Info),
     /// Copy some episodes of a data set to a new one; ids are kept.
     Split(Split),
+    /// Copy data sets of the same shape, one after the other, to a new one; episodes are numbered anew from 0.
+    Join(Join),
 }
 
 #[derive(Debug, Args)]
@@ -69,6 +73,18 @@ struct Split {
 }
 
 #[derive(Debug, Args)]
+struct Join {
+    /// Data-set folders or .parquet files; the new one is described as the first of them.
+    #[arg(required = true, num_args = 2..)]
+    paths: Vec<PathBuf>,
+    /// Folder to create.
+    #[arg(long)]
+    out: PathBuf,
+    #[command(flatten)]
+    writer: Writer,
+}
+
+#[derive(Debug, Args)]
 struct Writer {
     /// Size in MiB at which a shard is closed.
     #[arg(long, default_value_t = 32, value_parser = clap::value_parser!(u16).range(1..=1024))]
@@ -84,6 +100,7 @@ fn main() -> anyhow::Result<()> {
         Command::Export(export) => export.run(),
         Command::Info(info) => inspect(&info),
         Command::Split(split) => copy(&split),
+        Command::Join(parts) => join(&parts),
     }
 }
 
@@ -110,6 +127,43 @@ fn copy(split: &Split) -> anyhow::Result<()> {
     })?;
     bar.finish_and_clear();
     print_written(&split.out, &manifest)
+}
+
+fn join(parts: &Join) -> anyhow::Result<()> {
+    let open = |path: &PathBuf| Dataset::open(path);
+    let datasets = parts.paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+    let info = datasets[0].info().clone();
+    for (path, dataset) in parts.paths.iter().zip(&datasets) {
+        if let Some(what) = difference(&info, dataset.info()) {
+            bail!("{} has other {what} than {}", path.display(), parts.paths[0].display());
+        }
+    }
+    let bar = progress_bar();
+    bar.set_length(datasets.iter().map(|dataset| dataset.len() as u64).sum());
+    let manifest = write_whole(&parts.out, info, parts.writer.options(), |writer| {
+        let every = datasets.iter().flat_map(|each| (0..each.len()).map(move |at| each.read(at)));
+        for (episode_id, episode) in (0..).zip(bar.wrap_iter(every)) {
+            let episode = EpisodeData { episode_id, ..episode?.into_data() };
+            let rejected = |source| Error::Rejected { path: parts.out.clone(), episode_id, source };
+            writer.write(&Episode::new(episode, writer.info()).map_err(rejected)?)?;
+        }
+        Ok(())
+    })?;
+    bar.finish_and_clear();
+    print_written(&parts.out, &manifest)
+}
+
+/// In what data sets differ that cannot be one.
+fn difference(one: &DatasetInfo, other: &DatasetInfo) -> Option<&'static str> {
+    let frames = |info: &DatasetInfo| (info.height, info.width, info.channels);
+    let period = |info: &DatasetInfo| info.frame_period_seconds.to_bits();
+    match () {
+        () if frames(one) != frames(other) => Some("frames"),
+        () if period(one) != period(other) => Some("seconds a frame"),
+        () if one.actions != other.actions => Some("actions"),
+        () if one.labels != other.labels => Some("labels"),
+        () => None,
+    }
 }
 
 impl Split {

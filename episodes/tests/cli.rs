@@ -42,6 +42,29 @@ fn split_copies_the_episodes_asked_for() {
 }
 
 #[test]
+fn join_puts_data_sets_together_and_refuses_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let (two, both) = (path("two"), path("both"));
+    assert!(run(&["split", "--last", "2", "--out", &two], &sample()).status.success());
+    let joined = run(&["join", "--out", &both, &two], &sample());
+    assert!(joined.status.success(), "{joined:?}");
+    let info = run(&["info", "--json", "--verify"], Path::new(&both));
+    let info: Value = serde_json::from_slice(&info.stdout).unwrap();
+    assert_eq!(
+        (&info["episodes"], &info["first_id"], &info["last_id"]),
+        (&8.into(), &0.into(), &7.into())
+    );
+
+    let roll = sample().with_file_name("roll-heldout.parquet");
+    let refused = run(&["join", "--out", &path("none"), &two], &roll);
+    assert!(!refused.status.success());
+    let message = String::from_utf8(refused.stderr).unwrap();
+    assert!(message.contains("roll-heldout.parquet has other seconds a frame than"), "{message}");
+    assert!(!Path::new(&path("none")).exists());
+}
+
+#[test]
 fn info_prints_what_a_person_wants_to_know() {
     let info = run(&["info"], &sample());
     assert!(info.status.success(), "{info:?}");

@@ -265,7 +265,7 @@ fn gradients_reach_every_parameter() {
             let image = rendering.over(&step.mixture.mu_mix);
             let (masks, comps) = loss::mixture_kl(&step.mixture);
             let objects = step.objects.as_ref().unwrap();
-            let objects = objects.kl(&first, &config.objects.prior, true).total();
+            let objects = objects.kl(&config.objects.prior, true).total();
             let keypoints = model.detector().unwrap().forward(&frame);
             let gamma = model.detector().unwrap().gamma(&keypoints);
             let agent = step.mixture.log_masks.select(1, 0).exp();

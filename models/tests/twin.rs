@@ -99,12 +99,12 @@ impl Vectors {
         let mut results = Tensors::new();
         let mut state = model.initial_state(self.case.batch);
         for (t, step) in self.case.steps.iter().enumerate() {
-            let past = Past::of(&state);
+            let first = state.first();
             let prefix = format!("s{t}");
             let (next, gives, frame) = self.take(model, &prefix, step, state, false);
             let mut values = outcome(model, &next, &gives);
             if let Some(frame) = frame {
-                values.extend(self.terms(model, &past, &next, &gives, &frame));
+                values.extend(self.terms(model, &first, &next, &gives, &frame));
             }
             results.extend(
                 values.into_iter().map(|(name, value)| (format!("{prefix}.{name}"), value)),
@@ -121,11 +121,11 @@ impl Vectors {
         let mut state = model.initial_state(self.case.batch);
         let mut total = Tensor::zeros([self.case.batch], (Kind::Float, Device::Cpu));
         for (t, step) in self.case.training.iter().enumerate() {
-            let past = Past::of(&state);
+            let first = state.first();
             let prefix = format!("train.s{t}");
             let (next, gives, frame) = self.take(model, &prefix, step, state, true);
             let frame = frame.expect("training observes");
-            for (name, value) in self.terms(model, &past, &next, &gives, &frame) {
+            for (name, value) in self.terms(model, &first, &next, &gives, &frame) {
                 if value.dim() > 1 {
                     continue;
                 }
@@ -162,7 +162,7 @@ impl Vectors {
     fn terms(
         &self,
         model: &Gatsbi,
-        past: &Past,
+        first: &Tensor,
         state: &GatsbiState,
         step: &GatsbiStep,
         frame: &Tensor,
@@ -176,7 +176,7 @@ impl Vectors {
         let composite = rendering.over(&mixture.mu_mix);
         let (kl_mask, kl_comp) = loss::mixture_kl(mixture);
         let prior = &config.objects.prior;
-        let kl = objects.kl(&past.empty, prior, config.objects.aux_presence_kl);
+        let kl = objects.kl(prior, config.objects.aux_presence_kl);
         let mut terms = vec![
             ("prior.mask.mean", mask_prior.loc.shallow_clone()),
             ("prior.mask.std", mask_prior.scale.shallow_clone()),
@@ -196,7 +196,7 @@ impl Vectors {
                 loss::mixture_log_likelihood(frame, &mixture.log_masks, &mixture.components, sigma),
             ),
             ("likelihood.fixed_alpha", loss::gaussian_log_likelihood(frame, &fixed, sigma)),
-            ("residual_norm", loss::residual_norm(mixture, &past.first)),
+            ("residual_norm", loss::residual_norm(mixture, first)),
         ];
         if let Some(detector) = model.detector() {
             let keypoints = detector.forward(frame);
@@ -210,20 +210,6 @@ impl Vectors {
             terms.push(("keypoints.points", keypoints.points));
         }
         terms.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
-    }
-}
-
-/// What the terms of a step need of the state before it.
-struct Past {
-    /// Rows that have absorbed nothing, `[B]`.
-    first: Tensor,
-    /// Rows without objects, `[B]`.
-    empty: Tensor,
-}
-
-impl Past {
-    fn of(state: &GatsbiState) -> Self {
-        Self { first: state.first(), empty: state.objects.ids.eq(-1).all_dim(1, false) }
     }
 }
 

@@ -110,6 +110,7 @@ MODEL: dict[str, Any] = {
 }
 
 ORIGINAL = {"discovery": "first_frame", "presence": "product", "ids": "original", "scale_bounds": None, "merge": None}
+COLOURS = {"scale_bounds": [0.1, 0.25], "merge": 0.1, "unlike": 0.3, "handover": 0.9}
 
 OBSERVE, MEAN = Step("observe"), Step("observe", noise="mean")
 IMAGINE, SKIP = Step("imagine"), Step("skip")
@@ -245,6 +246,15 @@ CASES: dict[str, Micro] = {
         steps=[MEAN, blind("mean"), OBSERVE, IMAGINE, SKIP, SKIP, OBSERVE, IMAGINE],
         training=[OBSERVE, OBSERVE, blind()],
         objective=Objective("mixture", 0.1),
+        seed=0,
+    ),
+    "colours": Micro(
+        changes={"objects": {"agent_feature": "next"}, "tracking": COLOURS},
+        agent_slot=0,
+        batch=3,
+        steps=[OBSERVE, OBSERVE, OBSERVE, only(True, False, True), IMAGINE, OBSERVE, OBSERVE],
+        training=[OBSERVE, OBSERVE, OBSERVE],
+        objective=Objective("gaussian", 0.1),
         seed=0,
     ),
 }

@@ -261,7 +261,7 @@ fn add_scene(
                 add_following(terms, "catching", (&caught, &found), weight, pixels(model));
             }
             if let Some(found) = &seen.objects {
-                add_objects_kl(terms, model, objects, found, &first, moment.step);
+                add_objects_kl(terms, model, objects, found, moment.step);
             }
         }
     }
@@ -463,13 +463,12 @@ fn add_objects_kl(
     model: &Gatsbi,
     recipe: &ObjectRecipe,
     found: &ObjectStep,
-    first: &Tensor,
     step: u64,
 ) {
     let config = &model.config().objects;
     let mut prior = config.prior.clone();
     prior.scale_mean = recipe.scale_mean.at(step);
-    let kl = found.kl(first, &prior, config.aux_presence_kl);
+    let kl = found.kl(&prior, config.aux_presence_kl);
     let weight = recipe.kl.at(step);
     terms.add("kl_pres", kl.pres, weight);
     terms.add("kl_where", kl.place, weight);

@@ -167,7 +167,7 @@ impl Sequence {
             let (masks, comps) = loss::mixture_kl(&seen.mixture);
             let config = &model.config().objects;
             let objects = seen.objects.expect("the object module is on");
-            let objects = objects.kl(&first, &config.prior, config.aux_presence_kl).total();
+            let objects = objects.kl(&config.prior, config.aux_presence_kl).total();
             total = total - loss::gaussian_log_likelihood(frame, &image, SIGMA)
                 + masks
                 + comps

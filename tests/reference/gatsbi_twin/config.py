@@ -187,6 +187,10 @@ class TrackingConfig:
     """`monotone` or `original`."""
     scale_bounds: tuple[float, float] | None
     merge: float | None
+    unlike: float | None = None
+    """Distance between colours from which on they are of different objects."""
+    handover: float | None = None
+    """How far from where an object was lost it may be found."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -67,8 +68,19 @@ class Discovery(nn.Module):
         self.attribute_head = CellHead(hidden, sum(self.sizes))
         self.config = config
 
-    def forward(self, frame: Tensor, difference: Tensor, known: ObjectLatents, noise: Noise) -> Discovered:
-        """Candidates of frame [B, 3, H, W], its difference from the background, and tracked objects [B, N, ...]."""
+    def forward(
+        self,
+        frame: Tensor,
+        difference: Tensor,
+        known: ObjectLatents,
+        noise: Noise,
+        alike: Callable[[Tensor], Tensor] | None = None,
+    ) -> Discovered:
+        """Candidates of frame [B, 3, H, W], its difference from the background, and tracked objects [B, N, ...].
+
+        `alike` tells of latent vectors [B, G * G, Z] which tracked objects' colour they have, [B, G * G, N]; a candidate of
+        another colour than the object that covers it is not rejected.
+        """
         features = self.image_encoder(torch.cat([frame, difference], 1))
         features = torch.cat([features, self._known_map(known)], 1)
         dyna, dyna_scale = self.dyna_head(features).chunk(2, -1)
@@ -87,12 +99,14 @@ class Discovery(nn.Module):
         found.sampled_presence = draw_presence(found.presence, noise["discovery_presence"])
         place = self._absolute(found.raw_where.draw(noise["discovery_where"]))
         found.latents = ObjectLatents(
-            self._reject(found.sampled_presence, place, known),
+            found.sampled_presence,
             found.depth.draw(noise["discovery_depth"]),
             place,
             found.what.draw(noise["discovery_what"]),
             found.dyna.draw(noise["discovery_dynamics"]),
         )
+        same = None if alike is None else alike(found.latents.join())
+        found.latents.pres = self._reject(found.sampled_presence, place, known, same)
         return found
 
     def _known_map(self, known: ObjectLatents) -> Tensor:
@@ -109,9 +123,11 @@ class Discovery(nn.Module):
         shift = 2 / self.config.grid * raw[..., 2:].tanh() + centres
         return torch.cat([raw[..., :2].sigmoid(), shift], -1)
 
-    def _reject(self, presence: Tensor, place: Tensor, known: ObjectLatents) -> Tensor:
-        """Presence [B, G * G, 1], zero where a present tracked object covers the candidate."""
+    def _reject(self, presence: Tensor, place: Tensor, known: ObjectLatents, same: Tensor | None) -> Tensor:
+        """Presence [B, G * G, 1], zero where a present tracked object, of the same colour, covers the candidate."""
         threshold = math.inf if self.config.rejection is None else self.config.rejection
         overlap = intersection_over_union(place.detach(), known.where.detach())  # [B, G * G, N]
         taken = (overlap > threshold) & (known.pres > 0.5).transpose(1, 2)
+        if same is not None:
+            taken = taken & same
         return presence * ~taken.any(2, keepdim=True)

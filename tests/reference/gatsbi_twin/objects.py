@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from . import handover
 from .config import GatsbiConfig, TrackingConfig
 from .discovery import Discovered, Discovery
 from .glimpses import GlimpseDecoder
-from .latents import presence_kl
+from .latents import ObjectLatents, presence_kl
 from .layers import Normal
 from .memory import Memory, ObjectMemory
 from .noise import Noise
 from .propagation import Propagated, Propagation
 from .rendering import Rendering, render
-from .spatial import intersection_over_union
+from .spatial import intersection_over_union, paste
 from .surroundings import Agent, Surroundings
 
 
@@ -99,15 +100,21 @@ class ObjectModule(nn.Module):
         z = propagated.latents.join()
         if not late:
             post, prior = self._remember(z, post, prior, scenery.background, scenery.agent)
-        candidates = ObjectState(z, post, prior, state.ids, state.next_id)
-        order, proposal = z[..., 0], propagated.proposal
+        if tracking.handover is not None:
+            z = torch.where(state.z[..., :1] > 0.5, z, state.z)
+        proposal = propagated.proposal
         kl = self._kl_known(propagated, state.ids >= 0)
+        found = None
         if discover is not False:
-            difference = scenery.frame - scenery.difference_from
-            found = self.discovery(scenery.frame, difference, propagated.latents, noise)
-            new = self._new(found, state.next_id, scenery)
+            found, z, cells = self._discover(state, z, scenery, noise, tracking)
+        candidates = ObjectState(z, post, prior, state.ids, state.next_id)
+        order = z[..., 0]
+        if found is not None:
+            new = self._new(cells, state.next_id, scenery)
             rows = torch.full_like(state.next_id, True, dtype=torch.bool) if discover is True else discover
             new_order = torch.where(rows[:, None], new.z[..., 0], -1)
+            if tracking.handover is not None:
+                new_order = torch.where(new_order > 0.5, new_order, -1)
             for name, term in self._kl_new(found).items():
                 kl[name] = kl[name] + term * rows
             order = torch.cat([new_order, order], 1)
@@ -117,7 +124,10 @@ class ObjectModule(nn.Module):
         is_new = kept < order.shape[1] - self.config.max_objects
         state = _number(_gather(candidates, kept), is_new, tracking)
         if tracking.merge is not None:
-            _merge(state, tracking.merge)
+            unlike = None
+            if tracking.unlike is not None:
+                unlike = handover.different(self._colours(state.z), tracking.unlike)
+            _merge(state, tracking.merge, unlike)
         return state, ObjectStep(_gather_rows(proposal, kept), kl)
 
     def imagine(
@@ -148,9 +158,38 @@ class ObjectModule(nn.Module):
         """Draws objects z [B, N, Z]."""
         return render(self.decoder, z, self.config, self.image_size)
 
-    def _new(self, found: Discovered, next_id: Tensor, scenery: Scenery) -> ObjectState:
-        """Candidates with memories and identities."""
-        z = found.latents.join()
+    def _discover(
+        self, state: ObjectState, z: Tensor, scenery: Scenery, noise: Noise, tracking: TrackingConfig
+    ) -> tuple[Discovered, Tensor, Tensor]:
+        """What is found, and latent vectors of the known objects and of the finds after identities have been handed over."""
+        frame, mu_mix = scenery.frame, scenery.difference_from
+
+        def split(z: Tensor) -> ObjectLatents:
+            return ObjectLatents.split(z, self.config)
+
+        if tracking.unlike is None:
+            found = self.discovery(frame, frame - mu_mix, split(z), noise)
+            return found, z, found.latents.join()
+        known = handover.Known(z, state.z, state.ids, self._colours(state.z), frame, tracking.unlike)
+        if tracking.handover is None:
+            found = self.discovery(frame, frame - mu_mix, split(z), noise, known.same_colour)
+            return found, z, found.latents.join()
+        visible = known.visible()
+        _, alpha = self.decoder(split(state.z).what)
+        covered = paste(alpha * visible[..., :1, None, None], visible[..., 2:6], self.image_size).amax(1)
+        rest = torch.lerp(frame, mu_mix, covered)
+        found = self.discovery(rest, rest - mu_mix, split(visible), noise, known.same_colour)
+        cells = found.latents.join()
+        cells = handover.without(cells, known.bare(cells, mu_mix))
+        z, cells = known.reunited(cells, visible, tracking.handover)
+        return found, z, cells
+
+    def _colours(self, z: Tensor) -> Tensor:
+        """Mean colours of objects z [B, N, Z], [B, N, 3]."""
+        return handover.drawn(*self.decoder(ObjectLatents.split(z, self.config).what))
+
+    def _new(self, z: Tensor, next_id: Tensor, scenery: Scenery) -> ObjectState:
+        """Candidates z [B, G * G, Z] with memories and identities."""
         batch, cells, _ = z.shape
         start = (self.post.start(batch, cells), self.prior.start(batch, cells))
         if self.config.agent_feature == "next":
@@ -219,10 +258,15 @@ def _number(state: ObjectState, is_new: Tensor, tracking: TrackingConfig) -> Obj
     return state
 
 
-def _merge(state: ObjectState, threshold: float) -> None:
-    """Takes the presence from boxes that overlap a present one of a lower number by more than the threshold."""
+def _merge(state: ObjectState, threshold: float, unlike: Tensor | None) -> None:
+    """Takes the presence from boxes that overlap a present one of a lower number by more than the threshold.
+
+    Pairs that are unlike [B, MAX, MAX] stay.
+    """
     presence, boxes = state.z[..., 0], state.z[..., 2:6].detach()
     close = intersection_over_union(boxes, boxes) > threshold
+    if unlike is not None:
+        close &= ~unlike
     older = state.ids[:, None, :] < state.ids[:, :, None]
     same = (close & older & (presence > 0.5)[:, None, :]).any(-1)
     state.z = torch.cat([torch.where(same, 0, presence).unsqueeze(-1), state.z[..., 1:]], -1)

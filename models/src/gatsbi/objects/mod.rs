@@ -115,6 +115,8 @@ pub enum Discover {
 pub struct ObjectStep {
     /// Window each kept object was looked for in, `[B, MAX, 4]`; a new object's own box.
     pub proposal: Tensor,
+    /// Slots that held an object before the step, `[B, MAX, 1]`, 1 or 0.
+    filled: Tensor,
     propagated: Propagated,
     discovered: Option<Discovered>,
     discover: Discover,
@@ -257,7 +259,8 @@ impl ObjectModule {
             }
             None => next,
         };
-        (next, ObjectStep { proposal, propagated, discovered, discover })
+        let filled = state.ids.ge(0).to_kind(Kind::Float).unsqueeze(-1);
+        (next, ObjectStep { proposal, filled, propagated, discovered, discover })
     }
 
     /// Carries objects on without a frame; only the prior memory moves (object spec 3.10).
@@ -563,14 +566,13 @@ fn original_ids(
 }
 
 impl ObjectStep {
-    /// KL terms of propagation and discovery per row; `first [B]` bool marks rows that had no objects before.
-    pub fn kl(&self, first: &Tensor, prior: &DiscoveryPrior, aux_presence: bool) -> ObjectKl {
-        let live = first.logical_not().to_kind(Kind::Float).view([-1, 1, 1]);
-        let propagated = self.propagated.kl(&live, aux_presence.then_some(prior.presence));
+    /// KL terms of propagation and discovery per row. Slots never filled do not count.
+    pub fn kl(&self, prior: &DiscoveryPrior, aux_presence: bool) -> ObjectKl {
+        let propagated = self.propagated.kl(&self.filled, aux_presence.then_some(prior.presence));
         let Some(discovered) = &self.discovered else { return propagated };
         let active = match &self.discover {
             Discover::Rows(rows) => rows.to_kind(Kind::Float).view([-1, 1, 1]),
-            _ => live.ones_like(),
+            _ => Tensor::ones([self.filled.size()[0], 1, 1], (Kind::Float, self.filled.device())),
         };
         propagated.plus(&discovered.kl(&active, prior))
     }

@@ -141,12 +141,12 @@ impl Propagation {
 }
 
 impl Propagated {
-    /// KL terms per row (object spec 3.3, step 10); `live [B, 1, 1]` is 0 on rows that had no objects yet.
-    pub(crate) fn kl(&self, live: &Tensor, presence_prior: Option<f64>) -> ObjectKl {
-        let dyna = super::sum_per_row(&(self.dyna.kl(&self.dyna_prior) * live));
+    /// KL terms per row (object spec 3.3, step 10) of slots that are `filled [B, N, 1]`, 1 or 0.
+    pub(crate) fn kl(&self, filled: &Tensor, presence_prior: Option<f64>) -> ObjectKl {
+        let dyna = super::sum_per_row(&(self.dyna.kl(&self.dyna_prior) * filled));
         let pres = match presence_prior {
             Some(prior) => {
-                super::sum_per_row(&(kl_bernoulli(&self.attributes.presence, prior) * live))
+                super::sum_per_row(&(kl_bernoulli(&self.attributes.presence, prior) * filled))
             }
             None => dyna.zeros_like(),
         };

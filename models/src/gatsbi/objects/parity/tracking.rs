@@ -43,8 +43,7 @@ impl Track<'_> {
                 self.check_propagated(checker, t, &step, &state, &frame, &background);
             }
             self.check_discovered(checker, t, &step, &frame, &background);
-            let first = Tensor::from_slice(&[t == 0, t == 0]);
-            let kl = step.kl(&first, &config.objects.prior, true);
+            let kl = step.kl(&config.objects.prior, true);
             let log = |name: &str| self.record.at(&format!("log.{name}"), t);
             for (name, actual) in [
                 ("kl_pres", &kl.pres),

@@ -34,8 +34,7 @@ fn parity_case_e_train_gradients() {
         let scenery = scenery(&frame, &background);
         let (next, step) =
             module.observe(&state, &scenery, discover, &noise, &Tracking::original(), true);
-        let first = Tensor::from_slice(&[t == 0, t == 0]);
-        let kl = step.kl(&first, &config.objects.prior, true).total();
+        let kl = step.kl(&config.objects.prior, true).total();
         let image = module.render(&next.z).over(&background);
         let density = normal_log_density(&frame, &image, 0.2).flatten(1, -1);
         elbo = elbo + density.sum_dim_intlist(1, false, Kind::Float) - kl;
