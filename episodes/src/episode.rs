@@ -70,6 +70,13 @@ impl Episode {
         self.data.episode_id
     }
 
+    /// The same episode under another id.
+    #[must_use]
+    pub fn numbered(mut self, id: u64) -> Self {
+        self.data.episode_id = id;
+        self
+    }
+
     /// `T`, the number of frames, at least 1.
     pub fn length(&self) -> usize {
         self.data.length as usize

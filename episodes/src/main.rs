@@ -8,9 +8,7 @@ use std::{
 
 use anyhow::{Context as _, bail, ensure};
 use clap::{Args, Parser, Subcommand};
-use gatsbi_episodes::{
-    Dataset, DatasetInfo, Episode, EpisodeData, Error, Manifest, WriterOptions, write_whole,
-};
+use gatsbi_episodes::{Dataset, DatasetInfo, Manifest, WriterOptions, write_whole};
 use indicatif::{ProgressBar, ProgressStyle};
 
 mod report;
@@ -132,38 +130,26 @@ fn copy(split: &Split) -> anyhow::Result<()> {
 fn join(parts: &Join) -> anyhow::Result<()> {
     let open = |path: &PathBuf| Dataset::open(path);
     let datasets = parts.paths.iter().map(open).collect::<Result<Vec<_>, _>>()?;
-    let info = datasets[0].info().clone();
-    for (path, dataset) in parts.paths.iter().zip(&datasets) {
-        if let Some(what) = difference(&info, dataset.info()) {
-            bail!("{} has other {what} than {}", path.display(), parts.paths[0].display());
+    let (first, info) = (datasets[0].path(), datasets[0].info());
+    for dataset in &datasets {
+        let (name, provenance) = (info.name.clone(), info.provenance.clone());
+        let renamed = DatasetInfo { name, provenance, ..dataset.info().clone() };
+        if let Some((what, found, expected)) = renamed.difference(info) {
+            let (path, first) = (dataset.path().display(), first.display());
+            bail!("{path}: {what} is {found}, expected {expected} as in {first}");
         }
     }
     let bar = progress_bar();
     bar.set_length(datasets.iter().map(|dataset| dataset.len() as u64).sum());
-    let manifest = write_whole(&parts.out, info, parts.writer.options(), |writer| {
+    let manifest = write_whole(&parts.out, info.clone(), parts.writer.options(), |writer| {
         let every = datasets.iter().flat_map(|each| (0..each.len()).map(move |at| each.read(at)));
-        for (episode_id, episode) in (0..).zip(bar.wrap_iter(every)) {
-            let episode = EpisodeData { episode_id, ..episode?.into_data() };
-            let rejected = |source| Error::Rejected { path: parts.out.clone(), episode_id, source };
-            writer.write(&Episode::new(episode, writer.info()).map_err(rejected)?)?;
+        for (id, episode) in (0..).zip(bar.wrap_iter(every)) {
+            writer.write(&episode?.numbered(id))?;
         }
         Ok(())
     })?;
     bar.finish_and_clear();
     print_written(&parts.out, &manifest)
-}
-
-/// In what data sets differ that cannot be one.
-fn difference(one: &DatasetInfo, other: &DatasetInfo) -> Option<&'static str> {
-    let frames = |info: &DatasetInfo| (info.height, info.width, info.channels);
-    let period = |info: &DatasetInfo| info.frame_period_seconds.to_bits();
-    match () {
-        () if frames(one) != frames(other) => Some("frames"),
-        () if period(one) != period(other) => Some("seconds a frame"),
-        () if one.actions != other.actions => Some("actions"),
-        () if one.labels != other.labels => Some("labels"),
-        () => None,
-    }
 }
 
 impl Split {

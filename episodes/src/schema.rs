@@ -9,7 +9,7 @@
 //!
 //! | column | Parquet / Arrow type | null | contents |
 //! |---|---|---|---|
-//! | `episode_id` | `uint64` | no | unique within the data set, kept by `split` |
+//! | `episode_id` | `uint64` | no | unique within the data set, kept by `split`, given anew by `join` |
 //! | `length` | `uint32` | no | `T` >= 1 |
 //! | `rgb` | `large_binary` | no | `[T,H,W,C]` u8 |
 //! | `actions` | `list<float32>` | no | `[T,A]`, finite, units in the description; [`ACTION_CONVENTION`] |
@@ -33,6 +33,7 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use arrow_schema::{DataType, Field, Schema};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use crate::{Error, Result};
 
@@ -136,6 +137,12 @@ impl DatasetInfo {
     /// `A`, the dimension of an action.
     pub fn action_dimension(&self) -> usize {
         self.actions.len()
+    }
+
+    /// The first part in which this description is not `other`: its name, its value here and there, as JSON.
+    pub fn difference(&self, other: &Self) -> Option<(String, String, String)> {
+        let [a, b] = [self, other].map(|info| serde_json::to_value(info).unwrap_or_default());
+        (a != b).then(|| first_difference("description", &a, &b))
     }
 
     /// Checks that the description is one the format can hold.
@@ -299,6 +306,21 @@ fn written_type(kind: Kind) -> DataType {
         Kind::Floats => DataType::List(float_item()),
         Kind::Hash => DataType::FixedSizeBinary(32),
     }
+}
+
+fn first_difference(name: &str, a: &Value, b: &Value) -> (String, String, String) {
+    if let (Value::Object(a), Value::Object(b)) = (a, b) {
+        let names = a.keys().chain(b.keys());
+        let null = Value::Null;
+        let values = |name| (a.get(name).unwrap_or(&null), b.get(name).unwrap_or(&null));
+        for name in names {
+            let (a, b) = values(name);
+            if a != b {
+                return first_difference(name, a, b);
+            }
+        }
+    }
+    (name.into(), a.to_string(), b.to_string())
 }
 
 #[cfg(test)]

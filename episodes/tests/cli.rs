@@ -60,7 +60,8 @@ fn join_puts_data_sets_together_and_refuses_others() {
     let refused = run(&["join", "--out", &path("none"), &two], &roll);
     assert!(!refused.status.success());
     let message = String::from_utf8(refused.stderr).unwrap();
-    assert!(message.contains("roll-heldout.parquet has other seconds a frame than"), "{message}");
+    let expected = "roll-heldout.parquet: frame_period_seconds is 0.15, expected 0.2 as in ";
+    assert!(message.contains(&format!("{expected}{two}")), "{message}");
     assert!(!Path::new(&path("none")).exists());
 }
 

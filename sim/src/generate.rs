@@ -16,7 +16,7 @@ use gatsbi_episodes::{
     ActionDimension, Dataset, DatasetInfo, DatasetWriter, Episode, LabelLegend, Manifest,
     Provenance, WriterOptions,
 };
-use serde_json::{Value, json};
+use serde_json::json;
 
 use crate::{
     AGENT, BACKGROUND, Environment, Error, FIRST_OBJECT, Result, Scene, SceneSpec,
@@ -175,31 +175,8 @@ fn open(out: &Path, info: DatasetInfo, options: WriterOptions) -> Result<Dataset
     if !is_started {
         return Ok(DatasetWriter::create(out, info, options)?);
     }
-    let found = Dataset::open(out)?.info().clone();
-    if found != info {
-        return Err(difference(out, &found, &info));
+    if let Some((what, found, expected)) = Dataset::open(out)?.info().difference(&info) {
+        return Err(Error::OtherDataset { path: out.into(), what, found, expected });
     }
     Ok(DatasetWriter::append(out, options)?)
-}
-
-/// Says in which part two descriptions differ.
-fn difference(path: &Path, found: &DatasetInfo, expected: &DatasetInfo) -> Error {
-    let [a, b] = [found, expected].map(|info| serde_json::to_value(info).unwrap_or_default());
-    let (what, found, expected) = first_difference("description", &a, &b);
-    Error::OtherDataset { path: path.into(), what, found, expected }
-}
-
-fn first_difference(name: &str, a: &Value, b: &Value) -> (String, String, String) {
-    if let (Value::Object(a), Value::Object(b)) = (a, b) {
-        let names = a.keys().chain(b.keys());
-        let null = Value::Null;
-        let values = |name| (a.get(name).unwrap_or(&null), b.get(name).unwrap_or(&null));
-        for name in names {
-            let (a, b) = values(name);
-            if a != b {
-                return first_difference(name, a, b);
-            }
-        }
-    }
-    (name.into(), a.to_string(), b.to_string())
 }

@@ -14,8 +14,8 @@ use gatsbi_models::{
     config::Tracking,
     gatsbi::{
         loss,
-        mixture::{Memory, MixtureStep},
-        model::{Gatsbi, Observing},
+        mixture::Memory,
+        model::{Gatsbi, GatsbiStep, Observing},
         objects::{Agent, ObjectState, gather_rows},
     },
     nn::Normal,
@@ -218,13 +218,13 @@ fn see(
         let one = |x: &Tensor| slots.pick(&x.unsqueeze(-1)).squeeze_dim(-1);
         let names = [part::SURE, part::Z, part::IDS];
         observed.add(names, [one(&sure), slots.pick(&objects.z), one(&objects.ids)]);
-        observed.add_surroundings(part::OBSERVED, &seen.mixture, seen.agent);
+        observed.add_surroundings(part::OBSERVED, seen);
         if model.agent_slot().is_some() && beginnings(length).any(|from| from == t) {
-            let mut future = state.mixture.shallow_clone();
+            let mut future = state.shallow_clone();
             for action in &batch.actions[t as usize + 1..][..HORIZON as usize] {
-                let (next, seen, agent) = model.imagine_alone(&future, action, &noise);
+                let (next, seen) = model.imagine(future, action, &noise, &tracking);
                 future = next;
-                imagined.add_surroundings(part::IMAGINED, &seen, agent);
+                imagined.add_surroundings(part::IMAGINED, seen);
             }
         }
     }
@@ -245,16 +245,11 @@ impl Frames {
         }
     }
 
-    fn add_surroundings(
-        &mut self,
-        [mu_mix, names @ ..]: [&'static str; 4],
-        step: &MixtureStep,
-        agent: Option<Agent>,
-    ) {
-        let levels = (step.mu_mix.clamp(0.0, 1.0) * 255.0).round();
+    fn add_surroundings(&mut self, [mu_mix, agent @ ..]: [&'static str; 4], step: GatsbiStep) {
+        let levels = (step.mixture.mu_mix.clamp(0.0, 1.0) * 255.0).round();
         self.add([mu_mix], [levels.to_kind(Kind::Uint8)]);
-        if let Some(Agent { latent, history, action }) = agent {
-            self.add(names, [latent, history, action]);
+        if let Some(Agent { latent, history, action }) = step.agent {
+            self.add(agent, [latent, history, action]);
         }
     }
 }

@@ -239,23 +239,6 @@ impl Gatsbi {
         (state, GatsbiStep { mixture: step, objects: None, agent })
     }
 
-    /// Predicts agent and background without the objects, which do not act on them.
-    ///
-    /// # Shapes
-    /// Those of [`Gatsbi::imagine`]; no row is before its first frame.
-    pub fn imagine_alone(
-        &self,
-        before: &MixtureState,
-        action: &Tensor,
-        noise: &dyn Noise,
-    ) -> (MixtureState, MixtureStep, Option<Agent>) {
-        let action = self.enhance(action);
-        let first = Tensor::zeros([action.size()[0]], (Kind::Bool, action.device()));
-        let (after, step) = self.mixture.imagine(before, &action, &first, noise);
-        let agent = self.agent(before, &after, &action, true);
-        (after, step, agent)
-    }
-
     /// Passes over a frame that never came: predicted like [`Gatsbi::imagine`], and what was predicted is
     /// remembered as if it had been seen.
     pub fn skip(

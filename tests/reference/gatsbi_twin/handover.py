@@ -59,22 +59,15 @@ class Known:
         possible = (youth[:, :, None] > self.ids[:, None]) & (there[..., 0] > 0.5)[:, :, None] & lost[:, None]
         possible &= (strangeness < 1) & (distance < 1)
         price = torch.where(possible, strangeness + distance, torch.inf).detach()
-        taken = torch.zeros_like(there[..., 0], dtype=torch.bool)
+        least, choice = price.min(1)
+        favourite = price.argmin(2).gather(1, choice) == torch.arange(choice.shape[1], device=choice.device)
+        wanted = favourite & least.isfinite()
+        taken = torch.zeros_like(youth).scatter_add(1, choice, wanted.long()) > 0
+        rows = torch.arange(batch, device=choice.device)[:, None]
+        place = torch.where(wanted[..., None], there[rows, choice], self.z)[..., :6]
+        presence = torch.where(lost & ~wanted, place[..., 0].clamp(max=IN_MIND), place[..., 0])
         looks = torch.where(lost[..., None], self.before, self.z)[..., 6:]
-        places = []
-        for row in range(batch):
-            each = []
-            for n in range(self.z.shape[1]):
-                choice = int(price[row, :, n].argmin())
-                wanted = bool(price[row, choice, n].isfinite()) and int(price[row, choice].argmin()) == n
-                here = there[row, choice] if wanted else self.z[row, n]
-                if wanted:
-                    taken[row, choice] = True
-                elif lost[row, n]:
-                    here = torch.cat([here[:1].clamp(max=IN_MIND), here[1:]])
-                each.append(here[:6])
-            places.append(torch.stack(each))
-        z = torch.cat([torch.stack(places), looks], -1)
+        z = torch.cat([presence[..., None], place[..., 1:], looks], -1)
         return without(z, taken[:, finds:]), without(found, taken[:, :finds])
 
     def _strangeness(self, others: Tensor) -> Tensor:

@@ -163,25 +163,20 @@ class ObjectModule(nn.Module):
     ) -> tuple[Discovered, Tensor, Tensor]:
         """What is found, and latent vectors of the known objects and of the finds after identities have been handed over."""
         frame, mu_mix = scenery.frame, scenery.difference_from
-
-        def split(z: Tensor) -> ObjectLatents:
-            return ObjectLatents.split(z, self.config)
-
-        if tracking.unlike is None:
-            found = self.discovery(frame, frame - mu_mix, split(z), noise)
-            return found, z, found.latents.join()
-        known = handover.Known(z, state.z, state.ids, self._colours(state.z), frame, tracking.unlike)
-        if tracking.handover is None:
-            found = self.discovery(frame, frame - mu_mix, split(z), noise, known.same_colour)
-            return found, z, found.latents.join()
-        visible = known.visible()
-        _, alpha = self.decoder(split(state.z).what)
-        covered = paste(alpha * visible[..., :1, None, None], visible[..., 2:6], self.image_size).amax(1)
-        rest = torch.lerp(frame, mu_mix, covered)
-        found = self.discovery(rest, rest - mu_mix, split(visible), noise, known.same_colour)
+        known, alike, visible = None, None, z
+        if tracking.unlike is not None:
+            known = handover.Known(z, state.z, state.ids, self._colours(state.z), frame, tracking.unlike)
+            alike = known.same_colour
+        if known is not None and tracking.handover is not None:
+            visible = known.visible()
+            _, alpha = self.decoder(ObjectLatents.split(state.z, self.config).what)
+            drawn = paste(alpha * visible[..., :1, None, None], visible[..., 2:6], self.image_size)
+            frame = torch.lerp(frame, mu_mix, drawn.amax(1))
+        found = self.discovery(frame, frame - mu_mix, ObjectLatents.split(visible, self.config), noise, alike)
         cells = found.latents.join()
-        cells = handover.without(cells, known.bare(cells, mu_mix))
-        z, cells = known.reunited(cells, visible, tracking.handover)
+        if known is not None and tracking.handover is not None:
+            cells = handover.without(cells, known.bare(cells, mu_mix))
+            z, cells = known.reunited(cells, visible, tracking.handover)
         return found, z, cells
 
     def _colours(self, z: Tensor) -> Tensor:
