@@ -61,7 +61,7 @@ enum Command {
     },
     /// Train a checkpoint by a recipe.
     Train {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, roll-tiny, balls-tiny, or one that goes on from them (training/recipes).
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, push1-tiny, roll-tiny, balls-tiny, or one that goes on from them (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Data set.
@@ -87,7 +87,7 @@ enum Command {
     ///
     /// A run that was stopped goes on; one that is done is measured again.
     Ablate {
-        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, roll-tiny, balls-tiny, or one that goes on from them (training/recipes).
+        /// Recipe: a file, or roll, push1, push2, bair, balls, tiny, push1-tiny, roll-tiny, balls-tiny, or one that goes on from them (training/recipes).
         #[arg(long)]
         recipe: String,
         /// Variants to compare.

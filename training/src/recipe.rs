@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::{dynamics::HORIZON, variant::Variant};
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 20] = [
+const NAMED: [(&str, &str); 21] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -27,6 +27,7 @@ const NAMED: [(&str, &str); 20] = [
     ("tiny-following", include_str!("../recipes/tiny-following.toml")),
     ("tiny-dynamics", include_str!("../recipes/tiny-dynamics.toml")),
     ("tiny-foresight", include_str!("../recipes/tiny-foresight.toml")),
+    ("push1-tiny", include_str!("../recipes/push1-tiny.toml")),
     ("roll-tiny", include_str!("../recipes/roll-tiny.toml")),
     ("roll-tiny-following", include_str!("../recipes/roll-tiny-following.toml")),
     ("balls-tiny", include_str!("../recipes/balls-tiny.toml")),
