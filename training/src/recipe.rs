@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::{dynamics::HORIZON, variant::Variant};
 
 /// Recipes that are known by name.
-const NAMED: [(&str, &str); 21] = [
+const NAMED: [(&str, &str); 22] = [
     ("roll", include_str!("../recipes/roll.toml")),
     ("push1", include_str!("../recipes/push1.toml")),
     ("push2", include_str!("../recipes/push2.toml")),
@@ -30,6 +30,7 @@ const NAMED: [(&str, &str); 21] = [
     ("push1-tiny", include_str!("../recipes/push1-tiny.toml")),
     ("roll-tiny", include_str!("../recipes/roll-tiny.toml")),
     ("roll-tiny-following", include_str!("../recipes/roll-tiny-following.toml")),
+    ("roll-tiny-dynamics", include_str!("../recipes/roll-tiny-dynamics.toml")),
     ("balls-tiny", include_str!("../recipes/balls-tiny.toml")),
     ("balls-tiny-following", include_str!("../recipes/balls-tiny-following.toml")),
     ("balls-tiny-dynamics", include_str!("../recipes/balls-tiny-dynamics.toml")),

@@ -28,8 +28,9 @@ use crate::{
 enum Quantity {
     /// Images and crops: 1e-4 absolute.
     Image,
-    /// Everything else: 4e-5 absolute. The record is up to 2.1e-5 from its own repetition in double precision, and
-    /// another processor's kernels may be as far on the other side (2.8e-5 was seen with AVX2, 1.8e-5 with AVX-512).
+    /// Everything else: 6e-5 absolute. The record is up to 2.1e-5 from its own repetition in double precision, and
+    /// another processor's kernels may be further on the other side (2.8e-5 was seen with AVX2, 1.8e-5 and, on one with AMX
+    /// and a single thread, 4.1e-5 with AVX-512).
     Value,
     /// KLs, likelihoods, ELBOs: 1e-4 relative.
     Information,
@@ -89,7 +90,7 @@ impl<'a> Checker<'a> {
         let difference = (actual.reshape(expected.size()) - expected).abs();
         let (difference, tolerance) = match quantity {
             Quantity::Image => (difference, 1e-4),
-            Quantity::Value => (difference, 4e-5),
+            Quantity::Value => (difference, 6e-5),
             Quantity::Information => (difference / expected.abs().clamp_min(1.0), 1e-4),
             Quantity::Gradient => (difference / expected.abs().clamp_min(1e-6), 2e-3),
         };
