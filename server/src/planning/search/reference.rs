@@ -200,37 +200,53 @@ fn whole(name: &str, function: &Function) -> Optimiser {
     }
 }
 
-/// How likely ours must at least be better. mbrl-lib scales coloured noise without its lowest frequency, so that its deviation
-/// is 1.16 times what it is told over 12 steps, 1.22 over 3 and 2 over 2; ours is as told. That suits the first two functions
-/// and not the third, whose best forces lie at the limits. With noise scaled as theirs, ours were better with probabilities of
-/// 0.40, 0.54 and 0.46.
-fn lowest(optimiser: &str, function: &Function) -> f64 {
-    match (optimiser, function.name.as_str()) {
-        ("icem", "double_integrator") => 0.2,
-        _ => 0.4,
+/// The deviation of mbrl-lib's noise with a beta of 2, measured over 100,000 draws; it means to be 1, as ours is, but leaves the
+/// lowest frequency out of what it scales by.
+fn strength(optimiser: &str, steps: usize) -> f64 {
+    match (optimiser, steps) {
+        ("icem", 2) => 1.414,
+        ("icem", 3) => 1.118,
+        ("icem", 12) => 1.080,
+        ("icem", other) => panic!("the noise of {other} steps was not measured"),
+        _ => 1.0,
     }
+}
+
+/// The least costs that searches of ours find, in ascending order, with noise that is `strength` times as strong.
+fn found(optimiser: Optimiser, function: &Function, seeds: usize, strength: f64) -> Vec<f64> {
+    let least = |seed| {
+        let mut search = Search::new(function.space(), optimiser, seed, None);
+        while search.done() < search.iterations() {
+            let told = search.std.clone();
+            search.std.iter_mut().for_each(|std| *std *= strength);
+            let (actions, candidates) = search.propose();
+            search.std = told;
+            let each = actions.chunks(actions.len() / candidates);
+            search.learn(&ranks(each.map(|actions| function.cost(actions))));
+        }
+        f64::from(search.best().unwrap().rank.cost)
+    };
+    let mut found: Vec<f64> = (0..seeds as u64).map(least).collect();
+    found.sort_by(f64::total_cmp);
+    found
 }
 
 #[test]
 fn plans_are_as_good_as_theirs() {
     for Quality { function, optimiser, least } in record().qualities {
-        let mut found: Vec<f64> = (0..least.len() as u64)
-            .map(|seed| {
-                let mut search =
-                    Search::new(function.space(), whole(&optimiser, &function), seed, None);
-                while search.done() < search.iterations() {
-                    let (actions, candidates) = search.propose();
-                    let each = actions.chunks(actions.len() / candidates);
-                    search.learn(&ranks(each.map(|actions| function.cost(actions))));
-                }
-                f64::from(search.best().unwrap().rank.cost)
-            })
-            .collect();
-        found.sort_by(f64::total_cmp);
-        // How likely one of ours is better than one of theirs; the standard error of equals is 0.04.
-        let better = found.iter().map(|ours| least.iter().filter(|theirs| ours < theirs).count());
-        let better = better.sum::<usize>() as f64 / (found.len() * least.len()) as f64;
         let place = format!("{optimiser} on {}", function.name);
-        assert!(better > lowest(&optimiser, &function), "{place}: only {better} are better");
+        let found =
+            |strength| found(whole(&optimiser, &function), &function, least.len(), strength);
+        let ours = found(strength(&optimiser, function.steps));
+        // How likely one of ours is better than one of theirs: of equals 0.5, with a standard error of 0.04.
+        let better = ours.iter().map(|ours| least.iter().filter(|theirs| ours < theirs).count());
+        let better = better.sum::<usize>() as f64 / (ours.len() * least.len()) as f64;
+        // The least is 0.38, of iCEM on the double integrator: mbrl-lib also adds what it keeps to the candidates, of which ours
+        // is a part, and its momentum mixes variances, not deviations.
+        assert!(better > 0.35, "{place}: only {better} are better");
+        // With our own noise half of ours are better than the worst tenth of theirs.
+        let at = |sorted: &[f64], share: f64| sorted[(sorted.len() as f64 * share) as usize];
+        let (ours, theirs) = (at(&found(1.0), 0.5), at(&least, 0.9));
+        assert!(ours < theirs, "{place}: the median is {ours}, and theirs stay below {theirs}");
     }
 }

@@ -4,7 +4,7 @@ use tch::{Kind, Tensor};
 
 use super::{
     super::{
-        Discover, ObjectModule, ObjectState, ObjectStep,
+        Discover, Memory, ObjectModule, ObjectState, ObjectStep,
         latents::{Latents, place},
     },
     Checker, Quantity, Record, Recorded, full_record, gswm_config, load, scenery, video,
@@ -55,16 +55,38 @@ impl Track<'_> {
             ] {
                 checker.compare(&format!("t{t} {name}"), actual, &log(name), Quantity::Information);
             }
-            state = next;
             let proposal = step.proposal;
             checker.compare("log.proposal", &proposal, &log("proposal"), Quantity::Value);
-            let image = self.check_kept(checker, t, &state, &background);
+            let image = self.check_kept(checker, t, &next, &background);
+            state = self.recorded(t, next);
             let density = normal_log_density(&frame, &image, 0.2);
             let likelihood = density.flatten(1, -1).sum_dim_intlist(1, false, Kind::Float);
             elbo = (elbo.0 + likelihood, elbo.1 + kl.total());
         }
         checker.check("log.loglikelihood", &elbo.0, Quantity::Information);
         checker.check("log.elbo", &(&elbo.0 - &elbo.1), Quantity::Information);
+    }
+
+    /// The state after frame `t` as it was recorded, as far as it was. Ours has been compared with it; carried on, its
+    /// rounding would add up with that of the next frames.
+    fn recorded(&self, t: i64, ours: ObjectState) -> ObjectState {
+        let log = |name: &str| self.record.at(&format!("log.{name}"), t);
+        let latents = Latents {
+            pres: log("z_pres"),
+            depth: log("z_depth"),
+            place: log("z_where"),
+            what: log("z_what"),
+            dyna: log("z_dyna"),
+        };
+        let memory = |which: &str, ours: Memory| {
+            let part = |part: &str| self.record.find(&format!("t{t}.comb.{part}_{which}"));
+            match (part("h"), part("c")) {
+                (Some(h), Some(c)) => Memory { h: h.shallow_clone(), c: c.shallow_clone() },
+                _ => ours,
+            }
+        };
+        let (post, prior) = (memory("post", ours.post), memory("prior", ours.prior));
+        ObjectState { z: latents.join(), post, prior, ..ours }
     }
 
     fn check_propagated(
